@@ -1,0 +1,247 @@
+# guide: everything is built, tested and measured from here. `make help` lists the targets.
+#
+#   make demo        install what is missing, build, render the ajar scene with and without guiding, compare
+#   make test        install what is missing, build, run every test
+#   make             build only           make bench       run the microbenchmarks
+#   make format      clang-format in place  make lint        only check
+#
+#   config=release|debug|scalar|sanitize|tsan|coverage    each has its own folder (build/, build-debug/, ...)
+#   CC=clang  V=1  WERROR=1  NO_INSTALL=1  TESTS="sdtree bsdf"  GUIDE_SCENES=folder with downloaded scenes
+#   DEMO_SECONDS=40  DEMO_SIZE=320x180
+
+config ?= release
+DEMO_SECONDS ?= 40
+DEMO_SIZE ?= 320x180
+
+ifeq ($(origin CC),default)
+CC := $(firstword $(foreach c,gcc clang,$(if $(shell command -v $(c) 2>/dev/null),$(c))) cc)
+endif
+AR ?= ar
+
+# ---- configurations -------------------------------------------------------------------------------------------
+
+release_FLAGS := -O3 -DNDEBUG
+debug_FLAGS := -O0 -g
+scalar_FLAGS := -O2 -g -DGSD_NO_SIMD
+sanitize_FLAGS := -O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=undefined
+tsan_FLAGS := -O1 -g -fno-omit-frame-pointer -fsanitize=thread
+coverage_FLAGS := -O0 -g --coverage
+ifeq ($($(config)_FLAGS),)
+$(error config=$(config) is unknown: use release, debug, scalar, sanitize, tsan or coverage)
+endif
+B := build$(if $(filter-out release,$(config)),-$(config))
+
+# ---- compiler and libraries -----------------------------------------------------------------------------------
+
+# Homebrew keeps its headers where compilers do not look.
+PREFIX_INC := $(if $(wildcard /opt/homebrew/include),-I/opt/homebrew/include)
+PREFIX_LIB := $(if $(wildcard /opt/homebrew/lib),-L/opt/homebrew/lib)
+
+# Embree 4 where its header is found, else Embree 3 (examples/tracer/embree.h chooses alike).
+ifneq ($(filter-out clean format lint deps help,$(or $(MAKECMDGOALS),all)),)
+EMBREE := $(shell printf '\043if __has_include(<embree4/rtcore.h>)\nembree4\n\043else\nembree3\n\043endif\n' | \
+	$(CC) $(PREFIX_INC) -E -P - 2>/dev/null | grep -o 'embree[34]')
+endif
+
+WARN := -Wall -Wextra -Wshadow -Wstrict-prototypes $(if $(WERROR),-Werror)
+# Contraction off: a*b+c is rounded the same on every machine. errno and trapping say nothing about results.
+CFLAGS_ALL = -std=c11 $($(config)_FLAGS) -ffp-contract=off $(WARN) -pthread $(CFLAGS)
+TRACER_FLAGS := -fno-math-errno -fno-trapping-math
+CPPFLAGS_ALL = -D_POSIX_C_SOURCE=200809L -I. -Iexamples/tracer $(PREFIX_INC) $(CPPFLAGS)
+LDFLAGS_ALL = $(filter -fsanitize% --coverage,$($(config)_FLAGS)) -pthread $(PREFIX_LIB) $(LDFLAGS)
+LIBS := -l$(or $(EMBREE),embree3) -lOpenEXRCore -lexpat -lassimp -lz -lm -lpthread
+
+# ---- files ----------------------------------------------------------------------------------------------------
+
+HEADERS := $(wildcard guide_*.h)
+TRACER_MAINS := render imgerr
+TRACER_SRC := $(filter-out $(TRACER_MAINS:%=examples/tracer/%.c),$(wildcard examples/tracer/*.c))
+TRACER_OBJ := $(TRACER_SRC:examples/tracer/%.c=$(B)/obj/tracer/%.o)
+PROGRAMS := $(patsubst examples/tracer/%.c,$(B)/%,$(wildcard $(TRACER_MAINS:%=examples/tracer/%.c)))
+EXAMPLES := $(patsubst examples/%.c,$(B)/examples/%,$(wildcard examples/*.c))
+TESTS_ALL := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/test_*.c))
+BENCHES := $(patsubst bench/%.c,$(B)/%,$(wildcard bench/bench_*.c))
+# TESTS="a b" picks test_a and test_b, and "matrix", "cli"; empty = all.
+TEST_PROGRAMS := $(if $(TESTS),$(filter $(TESTS:%=$(B)/tests/test_%),$(TESTS_ALL)),$(TESTS_ALL))
+SOURCES := $(sort $(HEADERS) $(wildcard examples/*.c examples/tracer/*.[ch] tests/*.[ch] tests/*/*.[ch] bench/*.[ch]))
+SCRIPTS := .ci/run $(wildcard tests/*.sh examples/*.sh)
+
+.PHONY: all programs deps check-deps demo test run-demo run-test expected-count bench run-bench format lint clean help
+.DELETE_ON_ERROR:
+.SUFFIXES:
+
+# Build in parallel unless the caller said how.
+JOBS = $(if $(findstring j,$(filter-out --%,$(MAKEFLAGS))),,-j$(shell nproc 2>/dev/null || echo 2))
+SUB = +@$(MAKE) --no-print-directory $(JOBS)
+
+all: check-deps
+	$(SUB) programs
+
+programs: $(PROGRAMS) $(EXAMPLES) $(TESTS_ALL) $(BENCHES)
+
+help:
+	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
+
+# ---- rules ----------------------------------------------------------------------------------------------------
+
+Q := $(if $(V),,@)
+SAY = $(if $(V),@:,@printf '%-4s %s\n')
+
+# Rewritten only when the flags change, so that a change of flags rebuilds.
+$(B)/flags: FORCE
+	@mkdir -p $(B)
+	@printf '%s\n' '$(CC) $(CFLAGS_ALL) $(CPPFLAGS_ALL) $(LDFLAGS_ALL) $(LIBS)' | cmp -s - $@ || \
+		printf '%s\n' '$(CC) $(CFLAGS_ALL) $(CPPFLAGS_ALL) $(LDFLAGS_ALL) $(LIBS)' > $@
+FORCE:
+
+$(B)/obj/tracer/%.o: examples/tracer/%.c $(B)/flags
+	$(SAY) CC $<
+	$(Q)mkdir -p $(@D)
+	$(Q)$(CC) $(CFLAGS_ALL) $(TRACER_FLAGS) $(CPPFLAGS_ALL) -MMD -MP -c $< -o $@
+
+$(B)/obj/%.o: %.c $(B)/flags
+	$(SAY) CC $<
+	$(Q)mkdir -p $(@D)
+	$(Q)$(CC) $(CFLAGS_ALL) $(CPPFLAGS_ALL) -MMD -MP -c $< -o $@
+
+$(B)/libtracer.a: $(TRACER_OBJ)
+	$(SAY) AR $@
+	$(Q)rm -f $@
+	$(Q)$(AR) rcs $@ $^
+
+LINK = $(Q)mkdir -p $(@D) && $(CC) $(LDFLAGS_ALL) $(filter %.o %.a,$^)
+
+$(PROGRAMS): $(B)/%: $(B)/obj/tracer/%.o $(B)/libtracer.a
+	$(SAY) LD $@
+	$(LINK) $(LIBS) -o $@
+
+$(EXAMPLES): $(B)/examples/%: $(B)/obj/examples/%.o
+	$(SAY) LD $@
+	$(LINK) $(LIBS) -o $@
+
+$(TESTS_ALL): $(B)/tests/%: $(B)/obj/tests/%.o $(B)/libtracer.a
+	$(SAY) LD $@
+	$(LINK) -lcmocka $(LIBS) -o $@
+
+$(BENCHES): $(B)/%: $(B)/obj/bench/%.o $(B)/libtracer.a
+	$(SAY) LD $@
+	$(LINK) $(LIBS) -o $@
+
+.SECONDARY:
+-include $(wildcard $(B)/obj/*/*.d $(B)/obj/*.d)
+
+# ---- what the machine must have -------------------------------------------------------------------------------
+
+# One run of the preprocessor lists the headers that are not there, by the names of Debian's packages.
+define DEPS_SCRIPT
+list_missing() {
+    if ! command -v $(CC) >/dev/null 2>&1; then
+        echo "gcc libc6-dev libembree-dev libopenexr-dev libcmocka-dev libexpat1-dev libassimp-dev libstb-dev zlib1g-dev"
+        return
+    fi
+    printf '%s\n' \
+        '#if !__has_include(<stdio.h>)' 'libc6-dev' '#endif' \
+        '#if !__has_include(<embree4/rtcore.h>) && !__has_include(<embree3/rtcore.h>)' 'libembree-dev' '#endif' \
+        '#if !__has_include(<OpenEXR/openexr.h>)' 'libopenexr-dev' '#endif' \
+        '#if !__has_include(<cmocka.h>)' 'libcmocka-dev' '#endif' \
+        '#if !__has_include(<expat.h>)' 'libexpat1-dev' '#endif' \
+        '#if !__has_include(<assimp/scene.h>)' 'libassimp-dev' '#endif' \
+        '#if !__has_include(<stb/stb_image.h>)' 'libstb-dev' '#endif' \
+        '#if !__has_include(<zlib.h>)' 'zlib1g-dev' '#endif' |
+        $(CC) $(PREFIX_INC) -E -P - | tr -s '\n' ' '
+}
+missing=$$(list_missing | sed 's/ *$$//')
+[ -z "$$missing" ] && exit 0
+if command -v apt-get >/dev/null 2>&1; then
+    sudo=
+    [ "$$(id -u)" = 0 ] || sudo=sudo
+    command="$$sudo apt-get install -y --no-install-recommends $$missing"
+    command=$${command# }
+    if [ -n "$(NO_INSTALL)" ]; then
+        printf 'missing: %s\ninstall with: %s\n' "$$missing" "$$command" >&2
+        exit 1
+    fi
+    if [ -n "$$sudo" ] && ! command -v sudo >/dev/null 2>&1; then
+        printf 'missing: %s\nneither root nor sudo here: as root, run: %s\n' "$$missing" "$${command#sudo }" >&2
+        exit 1
+    fi
+    echo "installing: $$missing"
+    $$sudo env DEBIAN_FRONTEND=noninteractive apt-get update -qq || exit 1
+    $$sudo env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing >/dev/null || exit 1
+    missing=$$(list_missing | sed 's/ *$$//')
+    [ -z "$$missing" ] && exit 0
+    echo "still missing after the installation: $$missing (OpenEXR must be 3.1 or newer)" >&2
+    exit 1
+fi
+{
+    echo "missing (by Debian's names): $$missing"
+    echo "install with one of:"
+    echo "  dnf install gcc make embree-devel openexr-devel libcmocka-devel expat-devel assimp-devel stb-devel zlib-devel"
+    echo "  pacman -S --needed gcc make embree openexr cmocka expat assimp stb zlib"
+    echo "  brew install embree openexr cmocka expat assimp zlib"
+    echo '    (and for stb: git clone https://github.com/nothings/stb "$$(brew --prefix)/include/stb")'
+} >&2
+exit 1
+endef
+export DEPS_SCRIPT
+
+deps:
+	@sh -c "$$DEPS_SCRIPT"
+
+check-deps:
+	@NO_INSTALL=1 $(MAKE) --no-print-directory deps NO_INSTALL=1
+
+# ---- test, demo, bench ----------------------------------------------------------------------------------------
+
+test: deps
+	$(SUB) run-test
+
+run-test: $(TEST_PROGRAMS) $(PROGRAMS) $(EXAMPLES)
+	@BUILD=$(B) CONFIG=$(config) CC='$(CC)' TESTS='$(TESTS)' bash tests/run.sh $(TEST_PROGRAMS)
+	$(if $(filter coverage,$(config)),@$(MAKE) --no-print-directory coverage-report)
+
+# Write down how many tests there are now: `make test` fails when fewer run.
+expected-count: deps
+	$(SUB) programs
+	@BUILD=$(B) CONFIG=$(config) CC='$(CC)' RECORD=1 bash tests/run.sh $(TESTS_ALL)
+
+.PHONY: coverage-report
+coverage-report:
+	@printf 'lines run by the tests:\n'
+	@cd $(B) && for f in obj/tests/*.gcda obj/tracer/*.gcda; do \
+		[ -e "$$f" ] && $(if $(findstring clang,$(CC)),llvm-cov gcov,gcov) -n "$$f" 2>/dev/null; done | \
+		awk "/^File/ { f = \$$2 } /^Lines executed/ && f !~ /usr.include/ { split(\$$2, a, \":\"); p = a[2]; sub(/%/, \"\", p); \
+		if (p + 0 >= best[f] + 0) best[f] = p; f = \"\" } END { for (f in best) if (f) printf \"  %6.2f %%  %s\n\", best[f], f }" | sort -k3
+
+demo: deps
+	$(SUB) run-demo
+
+run-demo: $(PROGRAMS)
+	@BUILD=$(B) SECONDS_EACH=$(DEMO_SECONDS) SIZE=$(DEMO_SIZE) sh examples/demo.sh
+
+bench: deps
+	$(SUB) run-bench
+
+run-bench: $(BENCHES)
+	@for b in $(BENCHES); do echo "$$b"; $$b || exit 1; done
+
+# ---- upkeep ---------------------------------------------------------------------------------------------------
+
+# Formatting differs between versions of clang-format: only version 14 counts.
+CLANG_FORMAT ?= $(shell for c in clang-format-14 clang-format; do \
+	$$c --version 2>/dev/null | grep -q 'version 14\.' && { echo $$c; break; }; done)
+
+format:
+	@[ -n "$(CLANG_FORMAT)" ] || { echo 'format: needs clang-format 14' >&2; exit 1; }
+	@$(CLANG_FORMAT) -i $(SOURCES)
+
+lint:
+	@[ -n "$(CLANG_FORMAT)" ] || { echo 'lint: needs clang-format 14' >&2; exit 1; }
+	@$(CLANG_FORMAT) --dry-run -Werror --ferror-limit=1 $(SOURCES)
+	@for s in $(SCRIPTS); do bash -n $$s || exit 1; done
+	@! grep -nE '[[:space:]]+$$' $(SOURCES) $(SCRIPTS) Makefile $(wildcard *.md examples/scenes/*) || \
+		{ echo 'lint: white space at line ends' >&2; exit 1; }
+	@echo 'lint: clean'
+
+clean:
+	rm -rf build build-debug build-scalar build-sanitize build-tsan build-coverage out

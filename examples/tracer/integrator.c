@@ -1,0 +1,730 @@
+/* integrator.c: one integrator for every guiding method. A worker advances a tile's paths bounce by bounce, as arrays:
+
+     >>camera     start the paths
+     >>intersect  trace, add emission, prepare closures
+     >>find       method.find on the vertices that have a smooth part
+     >>nee        sample a light, weigh it against the mixture, trace a shadow ray
+     >>scatter    roulette, then a direction from bsdf or guide: one-sample MIS (Veach 1997)
+     >>record     carry radiance back along each path and hand the vertices to the method
+
+   Random numbers: each path has two generators. The guide draws from the second one only, so that a render whose
+   gates are all closed is the unguided render, bit for bit. */
+#include "integrator.h"
+#include "threads.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+#if defined(__SSE2__)
+#include <immintrin.h>
+#endif
+
+/* A path between bounces. */
+typedef struct path {
+    tr_rng rng, guide_rng;
+    vec3 origin, direction;
+    vec3 throughput, radiance;
+    float pdf;      /* of `direction` by the mixture; meaningless after a delta bounce */
+    float survival; /* product of albedos and eta^2: what roulette looks at, since guided throughput is small exactly
+                       where light is expected */
+    bool specular;  /* the last bounce was a delta one, or there was none */
+    bool seen;      /* a non-delta vertex has been met */
+    int x, y;
+    int last; /* newest link, -1 = none */
+} path;
+
+/* A path vertex, kept for the way back. */
+typedef struct link {
+    int previous;   /* link before it on the path, -1 = none */
+    int vertex;     /* in the worker's vertices, -1 = delta */
+    vec3 emitted;   /* radiance emitted here towards the previous vertex, MIS weight in */
+    vec3 reflected; /* NEE: light reflected here towards the previous vertex */
+    vec3 weight;    /* f cos / pdf, roulette in: from incident to reflected */
+    vec3 normal;
+    float distance; /* from the previous vertex */
+    bool environment;
+} link;
+
+struct tr_worker {
+    tr_counters counters;
+    path paths[TR_BATCH];
+    int active[TR_BATCH], active_count;
+    struct RTCRayHit hits[TR_BATCH];
+    tr_surface surfaces[TR_BATCH];
+    tr_closure closures[TR_BATCH];
+    float probability[TR_BATCH]; /* roulette: survival at this vertex */
+    /* Vertices with a smooth part, by their place k in the lookup. */
+    int smooth[TR_BATCH], smooth_count;
+    int place[TR_BATCH]; /* path -> k, -1 = none */
+    vec3 p[TR_BATCH], ns[TR_BATCH], wo[TR_BATCH];
+    float roughness[TR_BATCH], find_u[TR_BATCH][3], alpha[TR_BATCH];
+    void *handles;
+    int index[TR_BATCH];
+    vec3 wi[TR_BATCH];
+    float pdf_guide[TR_BATCH], sample_u[TR_BATCH][2];
+    /* NEE */
+    tr_light_sample lights[TR_BATCH];
+    vec3 light_f[TR_BATCH];
+    float light_pdf_bsdf[TR_BATCH];
+    /* way back */
+    tr_vertex *vertices;
+    link *links;
+    int vertex_count, vertex_capacity, link_count, link_capacity;
+};
+
+tr_worker *tr_worker_create(const tr_frame *frame)
+{
+    tr_worker *w = NULL;
+    if (posix_memalign((void **)&w, 64, sizeof *w) != 0)
+        return NULL;
+    memset(w, 0, sizeof *w);
+    size_t handle_size = frame->method->handle_size ? frame->method->handle_size : 1;
+    if (posix_memalign(&w->handles, 64, handle_size * TR_BATCH) != 0) {
+        free(w);
+        return NULL;
+    }
+    memset(w->handles, 0, handle_size * TR_BATCH);
+    return w;
+}
+
+void tr_worker_destroy(tr_worker *w)
+{
+    if (!w)
+        return;
+    free(w->handles);
+    free(w->vertices);
+    free(w->links);
+    free(w);
+}
+
+tr_counters *tr_worker_counters(tr_worker *w) { return &w->counters; }
+
+/* Room for one batch's worth of new vertices, so that the stages need not check. */
+static bool reserve(tr_worker *w, bool recording)
+{
+    if (!recording)
+        return true;
+    if (w->vertex_count + TR_BATCH > w->vertex_capacity) {
+        int capacity = w->vertex_capacity ? 2 * w->vertex_capacity : 8 * TR_BATCH;
+        tr_vertex *grown = realloc(w->vertices, sizeof *grown * (size_t)capacity);
+        if (!grown)
+            return false;
+        w->vertices = grown;
+        w->vertex_capacity = capacity;
+    }
+    if (w->link_count + TR_BATCH > w->link_capacity) {
+        int capacity = w->link_capacity ? 2 * w->link_capacity : 8 * TR_BATCH;
+        link *grown = realloc(w->links, sizeof *grown * (size_t)capacity);
+        if (!grown)
+            return false;
+        w->links = grown;
+        w->link_capacity = capacity;
+    }
+    return true;
+}
+
+/* ---- >>camera ----------------------------------------------------------------------------------------------- */
+
+/* Offset of a sample from the pixel's centre, in pixels, drawn from the reconstruction filter itself: every sample
+   then counts for one pixel with weight 1 (filter importance sampling, Ernst et al. 2006). */
+static float filter_offset(tr_filter filter, float u1, float u2)
+{
+    if (filter == TR_FILTER_TENT)
+        return u1 < 0.5f ? sqrtf(2 * u1) - 1 : 1 - sqrtf(2 - 2 * u1);
+    if (filter == TR_FILTER_GAUSSIAN) {
+        float r = 0.5f * sqrtf(-2 * logf(1 - u1 * 0.9997f)); /* sigma 0.5, cut at 4 sigma */
+        return r * cosf(2 * TR_PI * u2);
+    }
+    return u1 - 0.5f;
+}
+
+static float tan_half_fov_x(const tr_camera *camera, float aspect)
+{
+    float t = tanf(0.5f * camera->fov * (TR_PI / 180.0f));
+    switch (camera->fov_axis) {
+    case 1:
+        return t * aspect;
+    case 2:
+        return t * aspect / sqrtf(1 + aspect * aspect);
+    case 3:
+        return aspect > 1 ? t * aspect : t;
+    case 4:
+        return aspect > 1 ? t : t * aspect;
+    default:
+        return t;
+    }
+}
+
+static void camera_ray(const tr_frame *frame, path *p)
+{
+    const tr_camera *camera = &frame->scene->camera;
+    tr_filter filter = frame->scene->filter;
+    float u[6];
+    for (int i = 0; i < 6; ++i)
+        u[i] = rng_float(&p->rng);
+    float aspect = (float)frame->width / (float)frame->height, tx = tan_half_fov_x(camera, aspect);
+    float sx = ((float)p->x + 0.5f + filter_offset(filter, u[0], u[2])) / (float)frame->width;
+    float sy = ((float)p->y + 0.5f + filter_offset(filter, u[1], u[3])) / (float)frame->height;
+    vec3 d = v3((1 - 2 * sx) * tx, (1 - 2 * sy) * tx / aspect, 1); /* camera space: +x is left */
+    vec3 o = v3s(0);
+    if (camera->aperture > 0) {
+        float r = camera->aperture * sqrtf(u[4]), a = 2 * TR_PI * u[5];
+        o = v3(r * cosf(a), r * sinf(a), 0);
+        d = sub3(scale3(d, camera->focus), o);
+    }
+    p->origin = xform_point(&camera->to_world, o);
+    p->direction = norm3(xform_vector(&camera->to_world, d));
+}
+
+static void start_paths(tr_worker *w, const tr_frame *frame, int tile, int sample)
+{
+    int x0 = tile % frame->tiles_x * TR_TILE_W, y0 = tile / frame->tiles_x * TR_TILE_H;
+    int x1 = x0 + TR_TILE_W < frame->width ? x0 + TR_TILE_W : frame->width;
+    int y1 = y0 + TR_TILE_H < frame->height ? y0 + TR_TILE_H : frame->height;
+    w->active_count = w->vertex_count = w->link_count = 0;
+    for (int y = y0; y < y1; ++y)
+        for (int x = x0; x < x1; ++x) {
+            path *p = &w->paths[w->active_count];
+            uint64_t pixel = (uint64_t)y * (uint64_t)frame->width + (uint64_t)x;
+            uint64_t stream =
+                (frame->first_sample + (uint64_t)sample) * (uint64_t)frame->width * (uint64_t)frame->height + pixel;
+            p->rng = rng_seed(frame->settings->seed, 2 * stream);
+            p->guide_rng = rng_seed(frame->settings->seed, 2 * stream + 1);
+            p->throughput = v3s(1);
+            p->radiance = v3s(0);
+            p->survival = 1;
+            p->pdf = 0;
+            p->specular = true;
+            p->seen = false;
+            p->x = x;
+            p->y = y;
+            p->last = -1;
+            camera_ray(frame, p);
+            w->active[w->active_count] = w->active_count;
+            w->active_count++;
+        }
+    w->counters.paths += (uint64_t)w->active_count;
+}
+
+/* ---- >>intersect -------------------------------------------------------------------------------------------- */
+
+static void set_ray(struct RTCRay *ray, vec3 o, vec3 d, float far)
+{
+    ray->org_x = o.x;
+    ray->org_y = o.y;
+    ray->org_z = o.z;
+    ray->tnear = 0;
+    ray->dir_x = d.x;
+    ray->dir_y = d.y;
+    ray->dir_z = d.z;
+    ray->time = 0;
+    ray->tfar = far;
+    ray->mask = 0xffffffffu;
+    ray->id = 0;
+    ray->flags = 0;
+}
+
+/* Leave the surface on the side of w, by a step that covers rounding of the hit point. */
+static vec3 leave_surface(const tr_scene *scene, const tr_surface *s, vec3 w)
+{
+    float size = fmaxf(fmaxf(fabsf(s->p.x), fabsf(s->p.y)), fabsf(s->p.z));
+    float step = 2e-5f * fmaxf(size, 0.01f * scene->bounds_radius);
+    return madd3(s->p, s->ng, dot3(s->ng, w) < 0 ? -step : step);
+}
+
+static void trace_paths(tr_worker *w, const tr_frame *frame)
+{
+    double start = tr_wall_seconds();
+    for (int i = 0; i < w->active_count; ++i) {
+        const path *p = &w->paths[w->active[i]];
+        struct RTCRayHit *hit = &w->hits[w->active[i]];
+        set_ray(&hit->ray, p->origin, p->direction, INFINITY);
+        hit->hit.geomID = RTC_INVALID_GEOMETRY_ID;
+        hit->hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
+        tr_rtc_intersect(frame->scene->rtc, hit);
+    }
+    w->counters.rays += (uint64_t)w->active_count;
+    w->counters.trace += tr_wall_seconds() - start;
+}
+
+static void add_radiance(path *p, vec3 L) { p->radiance = add3(p->radiance, mul3(p->throughput, L)); }
+
+/* MIS weight of emission met by a traced direction against NEE. */
+static float emission_weight(const tr_frame *frame, const path *p, const tr_surface *hit)
+{
+    if (p->specular || !frame->nee)
+        return 1;
+    float light = tr_light_pdf(frame->scene, p->origin, p->direction, hit);
+    if (!(light > 0))
+        return 1; /* nothing that NEE could have sampled */
+    return frame->settings->no_bsdf_hits ? 0 : balance(p->pdf, light);
+}
+
+static link *push_link(tr_worker *w, path *p)
+{
+    link *l = &w->links[w->link_count];
+    memset(l, 0, sizeof *l);
+    l->previous = p->last;
+    l->vertex = -1;
+    p->last = w->link_count++;
+    return l;
+}
+
+/* Emission of whatever the ray met; then the closure there. Paths that end are dropped from the active list. */
+static void arrive(tr_worker *w, const tr_frame *frame, int depth, bool recording)
+{
+    const tr_scene *scene = frame->scene;
+    int kept = 0;
+    for (int i = 0; i < w->active_count; ++i) {
+        int id = w->active[i];
+        if (i + 16 < w->active_count)
+            tr_surface_prefetch(scene, &w->hits[w->active[i + 16]], 0);
+        if (i + 8 < w->active_count)
+            tr_surface_prefetch(scene, &w->hits[w->active[i + 8]], 1);
+        path *p = &w->paths[id];
+        const struct RTCRayHit *hit = &w->hits[id];
+        tr_surface *s = &w->surfaces[id];
+        bool met = hit->hit.geomID != RTC_INVALID_GEOMETRY_ID;
+        vec3 emitted = v3s(0);
+        bool visible = depth > 0 || !scene->hide_emitters;
+        if (met) {
+            tr_surface_from_hit(scene, hit, s);
+            if (scene->shapes[s->shape].light >= 0 && visible)
+                emitted = tr_surface_emission(scene, s, neg3(p->direction));
+        } else if (visible && scene->environment_count) {
+            emitted = tr_environment(scene, p->direction);
+        }
+        if (!black3(emitted)) {
+            emitted = scale3(emitted, emission_weight(frame, p, met ? s : NULL));
+            add_radiance(p, emitted);
+        }
+        if (recording) {
+            link *l = push_link(w, p);
+            l->emitted = emitted;
+            l->environment = !met;
+            l->distance = met ? s->t : INFINITY;
+            l->normal = met ? s->ng : v3s(0);
+        }
+        if (!met || depth + 1 >= frame->max_depth)
+            continue;
+        if (tr_closure_prepare(scene, s, neg3(p->direction), &w->closures[id]))
+            w->active[kept++] = id;
+    }
+    w->active_count = kept;
+}
+
+/* First-hit layers. */
+static void deposit_layers(tr_worker *w, const tr_frame *frame)
+{
+    for (int i = 0; i < w->active_count; ++i) {
+        int id = w->active[i];
+        const path *p = &w->paths[id];
+        size_t pixel = (size_t)p->y * (size_t)frame->width + (size_t)p->x;
+        vec3 albedo = tr_closure_albedo(&w->closures[id]), n = w->closures[id].frame.n;
+        float *a = frame->albedo + 3 * pixel, *m = frame->normal + 3 * pixel;
+        a[0] += albedo.x, a[1] += albedo.y, a[2] += albedo.z;
+        m[0] += n.x, m[1] += n.y, m[2] += n.z;
+    }
+}
+
+/* ---- >>find ------------------------------------------------------------------------------------------------- */
+
+static void find_handles(tr_worker *w, const tr_frame *frame)
+{
+    bool guiding = frame->method->find != NULL;
+    w->smooth_count = 0;
+    for (int i = 0; i < w->active_count; ++i) {
+        int id = w->active[i], k = w->smooth_count;
+        const tr_closure *c = &w->closures[id];
+        w->place[id] = -1;
+        if (c->delta_probability >= 1)
+            continue;
+        w->place[id] = k;
+        w->smooth[k] = id;
+        w->smooth_count++;
+        w->alpha[k] = 1;
+        if (!guiding)
+            continue;
+        w->p[k] = w->surfaces[id].p;
+        w->ns[k] = c->frame.n;
+        w->wo[k] = neg3(w->paths[id].direction);
+        w->roughness[k] = c->roughness;
+        for (int j = 0; j < 3; ++j)
+            w->find_u[k][j] = rng_float(&w->paths[id].guide_rng);
+    }
+    if (!guiding || w->smooth_count == 0)
+        return;
+    double start = tr_wall_seconds();
+    tr_lookup lookup = {w->smooth_count, w->p, w->ns, w->wo, w->roughness, (const float(*)[3])w->find_u};
+    frame->method->find(frame->method_data, &lookup, w->handles, w->alpha);
+    w->counters.query += tr_wall_seconds() - start;
+    for (int k = 0; k < w->smooth_count; ++k)
+        w->counters.guided_vertices += w->alpha[k] < 1;
+    w->counters.vertices += (uint64_t)w->smooth_count;
+}
+
+/* The alpha, cell and depth layers: at the first vertex of each path that could be guided. */
+static void describe_vertices(tr_worker *w, const tr_frame *frame)
+{
+    float cell[TR_BATCH], depth[TR_BATCH];
+    bool describe = frame->describe && frame->method->describe && w->smooth_count > 0;
+    if (describe)
+        frame->method->describe(frame->method_data, w->smooth_count, w->handles, cell, depth);
+    for (int k = 0; k < w->smooth_count; ++k) {
+        path *p = &w->paths[w->smooth[k]];
+        if (p->seen)
+            continue;
+        size_t pixel = (size_t)p->y * (size_t)frame->width + (size_t)p->x;
+        frame->alpha[pixel] += w->alpha[k];
+        frame->alpha_count[pixel] += 1;
+        if (describe) {
+            frame->cell[pixel] = cell[k];
+            frame->depth[pixel] = depth[k];
+        }
+    }
+}
+
+/* pdf_guide[k] for the first n entries of w->index, directions in w->wi. */
+static void query_pdf(tr_worker *w, const tr_frame *frame, int n)
+{
+    if (n == 0)
+        return;
+    double start = tr_wall_seconds();
+    frame->method->pdf(frame->method_data, n, w->index, w->handles, w->wi, w->pdf_guide);
+    w->counters.query += tr_wall_seconds() - start;
+}
+
+/* ---- >>nee -------------------------------------------------------------------------------------------------- */
+
+static void sample_lights(tr_worker *w, const tr_frame *frame)
+{
+    int guided = 0;
+    for (int k = 0; k < w->smooth_count; ++k) {
+        int id = w->smooth[k];
+        path *p = &w->paths[id];
+        tr_light_sample *l = &w->lights[k];
+        float u0 = rng_float(&p->rng), u1 = rng_float(&p->rng), u2 = rng_float(&p->rng);
+        w->pdf_guide[k] = 0;
+        if (!tr_light_sample_direction(frame->scene, w->surfaces[id].p, u0, u1, u2, l) || !(l->pdf > 0)) {
+            l->pdf = 0;
+            continue;
+        }
+        w->light_f[k] = tr_closure_eval(&w->closures[id], l->wi, &w->light_pdf_bsdf[k]);
+        if (black3(w->light_f[k])) {
+            l->pdf = 0;
+            continue;
+        }
+        if (w->alpha[k] < 1 && !l->delta) {
+            w->wi[k] = l->wi;
+            w->index[guided++] = k;
+        }
+    }
+    query_pdf(w, frame, guided);
+}
+
+/* The mixture's density: what one-sample MIS drew from. */
+static float mixture(const tr_closure *c, float alpha, float pdf_bsdf, float pdf_guide)
+{
+    float mix = alpha < 1 ? alpha * pdf_bsdf + (1 - alpha) * pdf_guide : pdf_bsdf;
+    return (1 - c->delta_probability) * mix;
+}
+
+static void next_event(tr_worker *w, const tr_frame *frame, bool recording)
+{
+    sample_lights(w, frame);
+    double start = tr_wall_seconds();
+    for (int k = 0; k < w->smooth_count; ++k) {
+        tr_light_sample *l = &w->lights[k];
+        if (!(l->pdf > 0))
+            continue;
+        const tr_surface *s = &w->surfaces[w->smooth[k]];
+        struct RTCRay ray;
+        vec3 origin = leave_surface(frame->scene, s, l->wi);
+        if (isinf(l->distance))
+            set_ray(&ray, origin, l->wi, INFINITY);
+        else /* to the sampled point: along wi from the shifted origin a curved light would shade itself */
+            set_ray(&ray, origin, sub3(madd3(s->p, l->wi, l->distance), origin), 1 - 1e-4f);
+        if (tr_rtc_occluded(frame->scene->rtc, &ray))
+            l->pdf = 0;
+        w->counters.shadow_rays++;
+    }
+    w->counters.trace += tr_wall_seconds() - start;
+    for (int k = 0; k < w->smooth_count; ++k) {
+        const tr_light_sample *l = &w->lights[k];
+        if (!(l->pdf > 0))
+            continue;
+        int id = w->smooth[k];
+        path *p = &w->paths[id];
+        const tr_closure *c = &w->closures[id];
+        float weight = 1;
+        if (!l->delta && !frame->settings->no_bsdf_hits)
+            weight = balance(l->pdf, mixture(c, w->alpha[k], w->light_pdf_bsdf[k], w->pdf_guide[k]));
+        float cosine = fabsf(dot3(c->frame.n, l->wi));
+        vec3 reflected = scale3(mul3(w->light_f[k], l->radiance), weight * cosine / l->pdf);
+        add_radiance(p, reflected);
+        if (recording)
+            w->links[p->last].reflected = reflected;
+    }
+}
+
+/* ---- >>scatter ---------------------------------------------------------------------------------------------- */
+
+#define ROULETTE_DEPTH 5
+
+/* Roulette on the product of albedos. Paths that lose are dropped. */
+static void roulette(tr_worker *w, const tr_frame *frame, int depth)
+{
+    int kept = 0;
+    for (int i = 0; i < w->active_count; ++i) {
+        int id = w->active[i];
+        path *p = &w->paths[id];
+        w->probability[id] = 1;
+        if (frame->settings->roulette == TR_ROULETTE_THROUGHPUT) {
+            p->survival *= clampf(max3(tr_closure_albedo(&w->closures[id])), 0, 1);
+            if (depth + 1 >= ROULETTE_DEPTH) {
+                float q = clampf(p->survival, 0.05f, 0.95f);
+                w->probability[id] = q;
+                if (rng_float(&p->rng) >= q)
+                    continue;
+                p->survival /= q;
+            }
+        }
+        w->active[kept++] = id;
+    }
+    w->active_count = kept;
+}
+
+/* A direction chosen at a vertex. */
+typedef struct choice {
+    vec3 wi, f;
+    float pdf_bsdf;
+    uint8_t kind;
+} choice;
+enum { CHOICE_NONE, CHOICE_DELTA, CHOICE_BSDF, CHOICE_GUIDE };
+
+/* Decide delta, bsdf or guide; draw what needs no method. Returns how many entries index lists (guide choices). */
+static int choose(tr_worker *w, choice *choices, vec3 *delta_weight, float *delta_eta)
+{
+    int guided = 0;
+    for (int i = 0; i < w->active_count; ++i) {
+        int id = w->active[i], k = w->place[id];
+        path *p = &w->paths[id];
+        const tr_closure *c = &w->closures[id];
+        choice *ch = &choices[id];
+        float u0 = rng_float(&p->rng), u1 = rng_float(&p->rng), u2 = rng_float(&p->rng), u3 = rng_float(&p->rng);
+        ch->kind = CHOICE_NONE;
+        if (u0 < c->delta_probability) {
+            if (tr_closure_sample_delta(c, u1, &ch->wi, &delta_weight[id], &delta_eta[id]))
+                ch->kind = CHOICE_DELTA;
+            continue;
+        }
+        if (k < 0)
+            continue;
+        if (w->alpha[k] < 1) {
+            float choose_u = rng_float(&p->guide_rng);
+            w->sample_u[k][0] = rng_float(&p->guide_rng);
+            w->sample_u[k][1] = rng_float(&p->guide_rng);
+            if (choose_u >= w->alpha[k]) {
+                ch->kind = CHOICE_GUIDE;
+                w->index[guided++] = k;
+                continue;
+            }
+        }
+        if (tr_closure_sample(c, u1, u2, u3, &ch->wi, &ch->f, &ch->pdf_bsdf))
+            ch->kind = CHOICE_BSDF;
+    }
+    return guided;
+}
+
+/* Complete the guided choices (f and bsdf pdf) and the guide's pdf of bsdf choices. */
+static void complete_choices(tr_worker *w, const tr_frame *frame, choice *choices, int guided)
+{
+    if (guided) {
+        double start = tr_wall_seconds();
+        frame->method->sample(frame->method_data, guided, w->index, w->handles, (const float(*)[2])w->sample_u, w->wi,
+                              w->pdf_guide);
+        w->counters.query += tr_wall_seconds() - start;
+        for (int i = 0; i < guided; ++i) {
+            int k = w->index[i], id = w->smooth[k];
+            choice *ch = &choices[id];
+            ch->wi = w->wi[k];
+            ch->f = w->pdf_guide[k] > 0 ? tr_closure_eval(&w->closures[id], ch->wi, &ch->pdf_bsdf) : v3s(0);
+        }
+    }
+    int asked = 0;
+    for (int i = 0; i < w->active_count; ++i) {
+        int id = w->active[i], k = w->place[id];
+        if (choices[id].kind == CHOICE_BSDF && w->alpha[k] < 1) {
+            w->wi[k] = choices[id].wi;
+            w->index[asked++] = k;
+        }
+    }
+    query_pdf(w, frame, asked);
+}
+
+static void fill_vertex(tr_worker *w, const tr_frame *frame, int id, const choice *ch, float cosine, float pdf_mix,
+                        vec3 throughput)
+{
+    path *p = &w->paths[id];
+    const tr_surface *s = &w->surfaces[id];
+    const tr_closure *c = &w->closures[id];
+    int k = w->place[id];
+    float smooth = 1 - c->delta_probability;
+    tr_vertex *v = &w->vertices[w->vertex_count];
+    w->links[p->last].vertex = w->vertex_count++;
+    v->p = s->p;
+    v->ng = s->ng;
+    v->ns = c->frame.n;
+    v->wo = neg3(p->direction);
+    v->wi = ch->wi;
+    v->f = ch->f;
+    v->cosine = cosine;
+    v->roughness = c->roughness;
+    v->pdf_mix = pdf_mix;
+    v->pdf_bsdf = smooth * ch->pdf_bsdf;
+    v->alpha = w->alpha[k];
+    v->pdf_guide = v->alpha < 1 ? smooth * w->pdf_guide[k] : 0;
+    v->u = 0;
+    v->flags = p->seen ? 0 : TR_VERTEX_FIRST;
+    if (black3(ch->f))
+        v->flags |= TR_VERTEX_REJECTED;
+    v->pixel_weight = throughput;
+    if (frame->estimate) {
+        const float *e = frame->estimate->data + 3 * ((size_t)p->y * (size_t)frame->width + (size_t)p->x);
+        float floor = frame->estimate_floor;
+        v->pixel_weight =
+            v3(throughput.x / (e[0] + floor), throughput.y / (e[1] + floor), throughput.z / (e[2] + floor));
+    }
+    v->distance = 0;
+    v->next_normal = v3s(0);
+    v->L = v3s(0);
+}
+
+/* Turn the choices into next rays. */
+static void scatter(tr_worker *w, const tr_frame *frame, bool recording)
+{
+    choice choices[TR_BATCH];
+    vec3 delta_weight[TR_BATCH];
+    float delta_eta[TR_BATCH];
+    complete_choices(w, frame, choices, choose(w, choices, delta_weight, delta_eta));
+    int kept = 0;
+    for (int i = 0; i < w->active_count; ++i) {
+        int id = w->active[i], k = w->place[id];
+        path *p = &w->paths[id];
+        const tr_closure *c = &w->closures[id];
+        const choice *ch = &choices[id];
+        float roulette_weight = 1 / w->probability[id], cosine = 1, pdf = 0;
+        vec3 weight, before = p->throughput;
+        if (ch->kind == CHOICE_NONE)
+            continue;
+        if (ch->kind == CHOICE_DELTA) {
+            weight = scale3(delta_weight[id], roulette_weight / c->delta_probability);
+            p->survival *= delta_eta[id];
+        } else {
+            pdf = mixture(c, w->alpha[k], ch->pdf_bsdf, w->pdf_guide[k]);
+            cosine = fabsf(dot3(c->frame.n, ch->wi));
+            if (!(pdf > 0))
+                continue;
+            weight = scale3(ch->f, roulette_weight * cosine / pdf);
+            if (recording)
+                fill_vertex(w, frame, id, ch, cosine, pdf, scale3(before, roulette_weight));
+        }
+        if (!finite3(weight) || max3(weight) <= 0)
+            continue;
+        if (recording)
+            w->links[p->last].weight = weight;
+        p->throughput = mul3(p->throughput, weight);
+        p->specular = ch->kind == CHOICE_DELTA;
+        p->seen |= ch->kind != CHOICE_DELTA;
+        p->pdf = pdf;
+        p->direction = ch->wi;
+        p->origin = leave_surface(frame->scene, &w->surfaces[id], ch->wi);
+        w->active[kept++] = id;
+    }
+    w->active_count = kept;
+}
+
+/* ---- >>record ----------------------------------------------------------------------------------------------- */
+
+/* Walk each path from its end, so that a vertex knows the radiance its direction brought. */
+static void carry_back(tr_worker *w, int path_count)
+{
+    for (int id = 0; id < path_count; ++id) {
+        vec3 incident = v3s(0);
+        const link *next = NULL;
+        for (int at = w->paths[id].last; at >= 0; at = w->links[at].previous) {
+            const link *l = &w->links[at];
+            if (l->vertex >= 0) {
+                tr_vertex *v = &w->vertices[l->vertex];
+                v->L = incident;
+                if (next) {
+                    v->distance = next->distance;
+                    v->next_normal = next->normal;
+                }
+            }
+            incident = add3(l->emitted, add3(l->reflected, mul3(l->weight, incident)));
+            next = l;
+        }
+    }
+}
+
+static void deposit(tr_worker *w, const tr_frame *frame, int path_count)
+{
+    for (int id = 0; id < path_count; ++id) {
+        const path *p = &w->paths[id];
+        size_t at = 3 * ((size_t)p->y * (size_t)frame->width + (size_t)p->x);
+        if (!finite3(p->radiance)) {
+            w->counters.bad_samples++;
+            continue;
+        }
+        const float value[3] = {p->radiance.x, p->radiance.y, p->radiance.z};
+        for (int c = 0; c < 3; ++c) {
+            frame->sum[at + (size_t)c] += value[c];
+            frame->sum_squares[at + (size_t)c] += (double)value[c] * value[c];
+        }
+    }
+}
+
+static void trace_batch(tr_worker *w, const tr_frame *frame, int tile, int sample, bool recording)
+{
+    start_paths(w, frame, tile, sample);
+    int path_count = w->active_count;
+    for (int depth = 0; w->active_count > 0 && depth < frame->max_depth; ++depth) {
+        if (!reserve(w, recording)) {
+            w->counters.out_of_memory = true;
+            return;
+        }
+        trace_paths(w, frame);
+        arrive(w, frame, depth, recording);
+        if (depth == 0)
+            deposit_layers(w, frame);
+        find_handles(w, frame);
+        describe_vertices(w, frame);
+        if (frame->nee && w->smooth_count > 0 && frame->scene->light_count > 0)
+            next_event(w, frame, recording);
+        roulette(w, frame, depth);
+        scatter(w, frame, recording);
+    }
+    deposit(w, frame, path_count);
+    if (recording) {
+        double start = tr_wall_seconds();
+        carry_back(w, path_count);
+        if (!frame->method->record(frame->method_data, tile, w->vertices, w->vertex_count))
+            w->counters.out_of_memory = true;
+        w->counters.record += tr_wall_seconds() - start;
+    }
+}
+
+void tr_render_tile(tr_worker *w, const tr_frame *frame, int tile)
+{
+#if defined(__SSE2__)
+    _MM_SET_FLUSH_ZERO_MODE(_MM_FLUSH_ZERO_ON);
+    _mm_setcsr(_mm_getcsr() | 0x0040); /* denormals are zero */
+#endif
+    double start = tr_wall_seconds();
+    bool recording = frame->record && frame->method->record &&
+                     (!frame->method->wants_records || frame->method->wants_records(frame->method_data, tile));
+    for (int s = 0; s < frame->samples; ++s)
+        trace_batch(w, frame, tile, s, recording);
+    w->counters.total += tr_wall_seconds() - start;
+}

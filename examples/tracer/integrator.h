@@ -1,0 +1,47 @@
+/* integrator.h: the wavefront integrator's seam to the pass loop. */
+#ifndef TR_INTEGRATOR_H
+#define TR_INTEGRATOR_H
+
+#include "tracer.h"
+
+#define TR_TILE_W 32
+#define TR_TILE_H 16
+#define TR_BATCH (TR_TILE_W * TR_TILE_H)
+
+/* What every tile of a pass shares. Pixels belong to one tile and a tile to one thread at a time: no locks. */
+typedef struct tr_frame {
+    const tr_scene *scene;
+    const tr_settings *settings;
+    const tr_method *method;
+    void *method_data;
+    int width, height, tiles_x, tiles_y;
+    int max_depth;
+    bool nee;
+    /* of this pass */
+    uint64_t first_sample; /* index of the round's first sample per pixel, over the whole render */
+    int samples;           /* samples per pixel to take now */
+    bool record;
+    bool describe;            /* fill the cell and depth layers from this round's first sample */
+    const tr_image *estimate; /* pixel estimate for the records' weights, or NULL */
+    float estimate_floor;
+    /* sums over the samples of this pass, double [height][width][3] */
+    double *sum, *sum_squares;
+    /* first-hit layers, summed over the pass: albedo 3, normal 3; alpha 1 and its count 1 */
+    float *albedo, *normal, *alpha, *alpha_count, *cell, *depth;
+} tr_frame;
+
+typedef struct tr_counters {
+    double trace, record, query, total; /* seconds on the worker's clock */
+    uint64_t rays, shadow_rays, paths, bad_samples, guided_vertices, vertices;
+    bool out_of_memory;
+} tr_counters;
+
+typedef struct tr_worker tr_worker;
+
+tr_worker *tr_worker_create(const tr_frame *frame);
+void tr_worker_destroy(tr_worker *worker);
+tr_counters *tr_worker_counters(tr_worker *worker);
+/* Trace `frame->samples` paths through every pixel of the tile, add them up and record them. */
+void tr_render_tile(tr_worker *worker, const tr_frame *frame, int tile);
+
+#endif

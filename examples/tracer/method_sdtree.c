@@ -1,0 +1,330 @@
+/* method_sdtree.c: guide_sdtree.h as a method of the example renderer.
+
+   Options (--set key=value), defaults as in guide_sdtree.h: target=radiance|simple|variance|switching, switch_pass, c
+   (samples of a cell before it splits), rho, max_depth, max_levels, min_samples, max_memory_mb,
+   spatial_filter=nearest|stochastic, directional_filter=nearest|box, learn_alpha=grid|adam|off (on = grid), alpha,
+   gate=on|off, gate_margin, gate_probe, guide_weight=on|off, history=on|off, uniform, alias=on|off,
+   simd=scalar|avx2|avx512, jitter=on|off (find looks up a jittered position), sparse=on|off (closed fields record only
+   some tiles). */
+#include <stdlib.h>
+#include <string.h>
+
+#include "tracer.h"
+
+#define GSD_IMPLEMENTATION
+#include "guide_sdtree.h"
+
+typedef struct sdtree {
+    gsd_field *field;
+    gsd_view view;
+    gsd_stream **streams;
+    int tiles;
+    bool jitter, sparse;
+    float fraction; /* of the tiles that record in this pass */
+    int pass;
+    uint64_t stream_peak;
+    tr_parallel_fn parallel;
+    void *parallel_user;
+} sdtree;
+
+/* ---- options */
+
+static const char *option(tr_method_env *env, const char *key)
+{
+    for (int i = 0; i < env->option_count; ++i)
+        if (!strcmp(env->options[i].key, key)) {
+            env->options[i].used = true;
+            return env->options[i].value;
+        }
+    return NULL;
+}
+
+typedef struct parser {
+    tr_method_env *env;
+    char *err;
+    size_t err_size;
+    bool ok;
+} parser;
+
+static void complain(parser *p, const char *key, const char *value, const char *expected)
+{
+    if (p->ok)
+        snprintf(p->err, p->err_size, "--set %s=%s: expected %s", key, value, expected);
+    p->ok = false;
+}
+
+/* Index of the value among names separated by '|', -1 where the option was not given. */
+static int choice(parser *p, const char *key, const char *names)
+{
+    const char *value = option(p->env, key), *at = names;
+    for (int i = 0; value; ++i) {
+        size_t n = strcspn(at, "|");
+        if (strlen(value) == n && !strncmp(value, at, n))
+            return i;
+        if (!at[n]) {
+            complain(p, key, value, names);
+            break;
+        }
+        at += n + 1;
+    }
+    return -1;
+}
+
+static double number(parser *p, const char *key, double fallback)
+{
+    const char *value = option(p->env, key);
+    if (!value)
+        return fallback;
+    char *end;
+    double x = strtod(value, &end);
+    if (end == value || *end || !(x >= 0))
+        complain(p, key, value, "a number >= 0");
+    return x;
+}
+
+static bool parse(parser *p, gsd_desc *d, sdtree *m)
+{
+    int learn;
+    d->target = (gsd_target)(choice(p, "target", "radiance|simple|variance|switching") + 1);
+    d->switch_pass = (uint32_t)number(p, "switch_pass", 0);
+    d->split_samples = (float)number(p, "c", 0);
+    d->rho = (float)number(p, "rho", 0);
+    d->max_depth = (uint32_t)number(p, "max_depth", 0);
+    d->max_levels = (uint32_t)number(p, "max_levels", 0);
+    d->min_samples = (uint32_t)number(p, "min_samples", 0);
+    d->max_bytes = (uint64_t)(number(p, "max_memory_mb", 0) * 1048576.0);
+    d->spatial_filter = (gsd_spatial_filter)(choice(p, "spatial_filter", "nearest|stochastic") + 1);
+    d->directional_filter = (gsd_directional_filter)(choice(p, "directional_filter", "nearest|box") + 1);
+    learn = choice(p, "learn_alpha", "off|adam|grid|on");
+    d->alpha_mode = (gsd_alpha_mode)(learn == 3 ? GSD_ALPHA_GRID : learn + 1);
+    d->alpha = (float)number(p, "alpha", 0);
+    d->uniform = (float)number(p, "uniform", 0);
+    d->no_gate = choice(p, "gate", "off|on") == 0;
+    d->gate_margin = (float)number(p, "gate_margin", 0);
+    d->gate_probe = (uint32_t)number(p, "gate_probe", 0);
+    d->no_guide_weight = choice(p, "guide_weight", "off|on") == 0;
+    d->no_history = choice(p, "history", "off|on") == 0;
+    d->alias = choice(p, "alias", "off|on") == 1;
+    d->simd = (gsd_simd)(choice(p, "simd", "scalar|avx2|avx512") + 1);
+    m->jitter = choice(p, "jitter", "off|on") == 1;
+    m->sparse = choice(p, "sparse", "off|on") != 0;
+    return p->ok;
+}
+
+/* ---- life */
+
+static void sdtree_destroy(void *method)
+{
+    sdtree *m = method;
+    if (!m)
+        return;
+    for (int i = 0; m->streams && i < m->tiles; ++i)
+        gsd_stream_destroy(m->streams[i]);
+    free(m->streams);
+    gsd_destroy(m->field);
+    free(m);
+}
+
+static void *sdtree_create(tr_method_env *env, char *err, size_t err_size)
+{
+    sdtree *m = calloc(1, sizeof *m);
+    gsd_desc desc;
+    parser p = {env, err, err_size, true};
+    const vec3 lo = env->scene->bounds_min, hi = env->scene->bounds_max;
+    memset(&desc, 0, sizeof desc);
+    snprintf(err, err_size, "out of memory");
+    if (!m)
+        return NULL;
+    memcpy(desc.bounds_min, &lo, sizeof desc.bounds_min);
+    memcpy(desc.bounds_max, &hi, sizeof desc.bounds_max);
+    m->tiles = env->tiles;
+    m->parallel = env->parallel;
+    m->parallel_user = env->parallel_user;
+    if (!parse(&p, &desc, m)) {
+        sdtree_destroy(m);
+        return NULL;
+    }
+    gsd_result result = gsd_create(&desc, &m->field);
+    m->streams = result ? NULL : calloc((size_t)m->tiles, sizeof *m->streams);
+    for (int i = 0; m->streams && i < m->tiles && !result; ++i)
+        result = gsd_stream_create(m->field, &m->streams[i]);
+    if (result || !m->streams) {
+        snprintf(err, err_size, "sdtree: %s", gsd_result_string(result ? result : GSD_OUT_OF_MEMORY));
+        sdtree_destroy(m);
+        return NULL;
+    }
+    m->view = gsd_get_view(m->field);
+    m->fraction = 1;
+    return m;
+}
+
+/* ---- passes */
+
+static bool sdtree_begin_pass(void *method, const tr_pass *pass)
+{
+    sdtree *m = method;
+    m->pass = pass->index;
+    m->fraction = m->sparse ? gsd_record_fraction(m->field) : 1;
+    return !pass->last;
+}
+
+/* Whether a tile's paths are worth recording: a fixed pseudo-random subset that changes from pass to pass. */
+static bool sdtree_wants_records(void *method, int tile)
+{
+    const sdtree *m = method;
+    uint32_t h = ((uint32_t)tile * 0x9e3779b1u) ^ ((uint32_t)m->pass * 0x85ebca6bu);
+    h = (h ^ h >> 15) * 0x2c1b3c6du;
+    h = (h ^ h >> 12) * 0x297a2d39u;
+    h ^= h >> 15;
+    return (float)(h >> 8) < m->fraction * 16777216.0f;
+}
+
+static gsd_training_sample convert(const tr_vertex *v)
+{
+    float p[3], d[3], L[3], f[3], w[3];
+    memcpy(p, &v->p, sizeof p);
+    memcpy(d, &v->wi, sizeof d);
+    memcpy(L, &v->L, sizeof L);
+    memcpy(f, &v->f, sizeof f);
+    memcpy(w, &v->pixel_weight, sizeof w);
+    gsd_training_sample s = gsd_make_sample(p, d, L, f, v->cosine, w, v->pdf_mix, v->pdf_bsdf, v->pdf_guide);
+    if (v->flags & TR_VERTEX_REJECTED) {
+        s.radiance = GSD_REJECTED;
+        s.contribution = s.pixel_contribution = 0;
+    }
+    return s;
+}
+
+static bool sdtree_record(void *method, int tile, const tr_vertex *vertices, int n)
+{
+    sdtree *m = method;
+    gsd_training_sample samples[64];
+    bool ok = true;
+    for (int done = 0; done < n;) {
+        int k = 0;
+        for (; k < 64 && done < n; ++k, ++done)
+            samples[k] = convert(&vertices[done]);
+        ok = !gsd_record(m->streams[tile], samples, (uint32_t)k) && ok;
+    }
+    return ok;
+}
+
+static void sdtree_flush(void *method)
+{
+    sdtree *m = method;
+    uint64_t bytes = 0;
+    for (int i = 0; i < m->tiles; ++i)
+        bytes += gsd_stream_size(m->streams[i]) * sizeof(gsd_training_sample);
+    m->stream_peak = bytes > m->stream_peak ? bytes : m->stream_peak;
+    gsd_accumulate(m->field, m->streams, (uint32_t)m->tiles, m->parallel, m->parallel_user); /* losses: in the stats */
+    for (int i = 0; i < m->tiles; ++i)
+        gsd_stream_clear(m->streams[i]);
+}
+
+static bool sdtree_end_pass(void *method, const tr_pass *pass)
+{
+    sdtree *m = method;
+    gsd_pass info;
+    if (pass->last)
+        return true;
+    sdtree_flush(m);
+    info.spp = (uint32_t)pass->spp;
+    gsd_result result = gsd_refine(m->field, &info, m->parallel, m->parallel_user);
+    m->view = gsd_get_view(m->field);
+    return !result;
+}
+
+/* ---- queries */
+
+static void sdtree_find(void *method, const tr_lookup *lookup, void *handles, float *alpha)
+{
+    const sdtree *m = method;
+    if (gsd_all_closed(m->field)) {
+        gsd_handle *h = handles;
+        for (int i = 0; i < lookup->n; ++i)
+            alpha[i] = 1;
+        memset(h, 0, (size_t)lookup->n * sizeof *h);
+        return;
+    }
+    gsd_find_batch(&m->view, (uint32_t)lookup->n, NULL, &lookup->p->x, sizeof(vec3),
+                   m->jitter && lookup->u ? lookup->u[0] : NULL, sizeof lookup->u[0], handles, alpha);
+}
+
+/* Index lists of ints are lists of uint32_t: the two types may alias, and no index is negative. */
+static void sdtree_sample(void *method, int n, const int *index, const void *handles, const float (*u)[2], vec3 *wi,
+                          float *pdf)
+{
+    const sdtree *m = method;
+    gsd_sample_batch(&m->view, (uint32_t)n, (const uint32_t *)index, handles, u[0], sizeof u[0], &wi->x, sizeof *wi,
+                     pdf);
+}
+
+static void sdtree_pdf(void *method, int n, const int *index, const void *handles, const vec3 *wi, float *pdf)
+{
+    const sdtree *m = method;
+    gsd_pdf_batch(&m->view, (uint32_t)n, (const uint32_t *)index, handles, &wi->x, sizeof *wi, pdf);
+}
+
+/* ---- reports */
+
+/* Cell number, and depth of the leaf that the normal +z points into. */
+static void sdtree_describe(void *method, int n, const void *handles, float *cell, float *depth)
+{
+    const sdtree *m = method;
+    const gsd_handle *h = handles;
+    for (int i = 0; i < n; ++i) {
+        uint32_t deepest = 0;
+        for (uint32_t k = 0; k < 64; ++k) { /* deepest of 64 probes */
+            uint32_t x = (k % 8 * 2 + 1) << 20, y = (k / 8 * 2 + 1) << 20;
+            uint32_t leaf = m->view.nodes[gsd_leaf_at(&m->view, &h[i], x, y)].leaf.x >> 24;
+            deepest = leaf > deepest ? leaf : deepest;
+        }
+        cell[i] = (float)h[i].cell;
+        depth[i] = (float)deepest;
+    }
+}
+
+static void sdtree_stats(void *method, tr_method_stats *stats)
+{
+    const sdtree *m = method;
+    gsd_stats s;
+    gsd_get_stats(m->field, &s);
+    memset(stats, 0, sizeof *stats);
+    stats->samples = s.samples;
+    stats->refused = s.refused;
+    stats->cells = s.cells;
+    stats->bytes = s.bytes;
+    stats->extra_bytes = (double)m->stream_peak + (double)(s.peak_bytes - s.bytes);
+    snprintf(stats->json, sizeof stats->json,
+             "\"passes\": %u, \"zeros\": %llu, \"rejected\": %llu, \"clamped\": %llu, \"lost\": %llu, \"trees\": %u, "
+             "\"nodes\": %llu, \"leaves\": %llu, \"building_nodes\": %llu, \"peak_bytes\": %llu, \"max_depth\": %u, "
+             "\"mean_depth\": %.3f, \"effective_rho\": %.4g, \"split_cells\": %u, \"rebuilt_trees\": %u, "
+             "\"waiting_cells\": %u, \"unread_cells\": %u, \"open_cells\": %u, \"closed_cells\": %u, "
+             "\"unjudged_cells\": %u, \"opened\": %llu, \"closed\": %llu, \"probed\": %llu, \"closed_share\": %.4f, "
+             "\"mean_alpha\": %.4f, \"record_fraction\": %.4f",
+             s.passes, (unsigned long long)s.zeros, (unsigned long long)s.rejected, (unsigned long long)s.clamped,
+             (unsigned long long)s.lost, s.trees, (unsigned long long)s.nodes, (unsigned long long)s.leaves,
+             (unsigned long long)s.building_nodes, (unsigned long long)s.peak_bytes, s.max_depth, (double)s.mean_depth,
+             (double)s.effective_rho, s.split_cells, s.rebuilt_trees, s.waiting_cells, s.unread_cells, s.open_cells,
+             s.closed_cells, s.unjudged_cells, (unsigned long long)s.opened, (unsigned long long)s.closed,
+             (unsigned long long)s.probed, (double)s.closed_share, (double)s.mean_alpha,
+             (double)gsd_record_fraction(m->field));
+}
+
+const tr_method tr_method_sdtree = {.name = "sdtree",
+                                    .summary = "spatial tree of directional quadtrees (guide_sdtree.h)",
+                                    .handle_size = sizeof(gsd_handle),
+                                    .learns = true,
+                                    .create = sdtree_create,
+                                    .destroy = sdtree_destroy,
+                                    .begin_pass = sdtree_begin_pass,
+                                    .find = sdtree_find,
+                                    .sample = sdtree_sample,
+                                    .pdf = sdtree_pdf,
+                                    .record = sdtree_record,
+                                    .wants_records = sdtree_wants_records,
+                                    .flush = sdtree_flush,
+                                    .end_pass = sdtree_end_pass,
+                                    .describe = sdtree_describe,
+                                    .wants_pixel_estimate = true,
+                                    .stats = sdtree_stats};

@@ -1,0 +1,555 @@
+/* passes.c: the pass loop: 1, 2, 4, ... samples per pixel, learning after each, images combined by one scalar weight
+   per pass.
+
+     >>rounds   a pass is cut into rounds of bounded memory; the method takes its records in after each
+     >>combine  groups of passes, their variances and weights
+     >>estimate the pixel estimate for variance-aware targets
+     >>loop     tr_render */
+#include "integrator.h"
+#include "threads.h"
+
+#include <pthread.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define MAX_PASSES 32
+#define ROUND_PATHS (1 << 17) /* paths between two flushes: bounds the memory of records */
+
+/* Passes that were sampled in the same way: plain sums are the best way to join them. */
+typedef struct group {
+    double *sum, *sum_squares;
+    int spp;
+    bool guided;
+    double variance; /* per sample, relative, trimmed mean over pixels */
+    double weight;
+} group;
+
+typedef struct render_state {
+    const tr_settings *settings;
+    tr_frame frame;
+    tr_pool *pool;
+    tr_worker **idle; /* workers not in use */
+    int idle_count, worker_count;
+    pthread_mutex_t lock;
+    tr_worker **workers;
+    group groups[MAX_PASSES];
+    int group_count;
+    tr_image estimate, combined, variance;
+    tr_result *result;
+    double start_cpu, update_cpu;
+    uint64_t round_tile; /* first tile of the round */
+} render_state;
+
+static size_t pixel_count(const render_state *r) { return (size_t)r->frame.width * (size_t)r->frame.height; }
+static double cpu_used(const render_state *r) { return tr_cpu_seconds() - r->start_cpu; }
+
+/* ---- >>rounds ----------------------------------------------------------------------------------------------- */
+
+static void render_tiles(void *context, uint32_t begin, uint32_t end)
+{
+    render_state *r = context;
+    pthread_mutex_lock(&r->lock);
+    tr_worker *worker = r->idle[--r->idle_count];
+    pthread_mutex_unlock(&r->lock);
+    for (uint32_t i = begin; i < end; ++i)
+        tr_render_tile(worker, &r->frame, (int)(r->round_tile + i));
+    pthread_mutex_lock(&r->lock);
+    r->idle[r->idle_count++] = worker;
+    pthread_mutex_unlock(&r->lock);
+}
+
+static void flush_records(render_state *r)
+{
+    double start = tr_cpu_seconds();
+    if (r->frame.record && r->settings->method->flush)
+        r->settings->method->flush(r->frame.method_data);
+    r->update_cpu += tr_cpu_seconds() - start;
+}
+
+/* `samples` per pixel over the whole image; tiles in groups when the image is large. Rounds depend on sizes alone. */
+static void render_samples(render_state *r, uint64_t first_sample, int samples)
+{
+    tr_frame *f = &r->frame;
+    int tiles = f->tiles_x * f->tiles_y, per_round = ROUND_PATHS / (TR_BATCH * samples);
+    f->first_sample = first_sample;
+    f->samples = samples;
+    if (per_round < 1)
+        per_round = 1;
+    for (int first = 0; first < tiles; first += per_round) {
+        int count = tiles - first < per_round ? tiles - first : per_round;
+        r->round_tile = (uint64_t)first;
+        tr_pool_run(r->pool, (uint32_t)count, 1, render_tiles, r);
+        flush_records(r);
+    }
+}
+
+static int samples_per_round(const render_state *r)
+{
+    size_t n = ROUND_PATHS / pixel_count(r);
+    return n < 1 ? 1 : n > 64 ? 64 : (int)n;
+}
+
+/* ---- >>combine ---------------------------------------------------------------------------------------------- */
+
+static int compare_doubles(const void *a, const void *b)
+{
+    double x = *(const double *)a, y = *(const double *)b;
+    return (x > y) - (x < y);
+}
+
+/* Mean over pixels of the per-sample variance over (estimate^2 + floor^2), without the worst 0.1 % of pixels: the
+   error measure's own scale. Negative = too few samples to tell. */
+static double relative_variance(const render_state *r, const group *g)
+{
+    size_t n = pixel_count(r);
+    if (g->spp < 2)
+        return -1;
+    double *value = malloc(n * sizeof *value), mean = 0;
+    if (!value)
+        return -1;
+    for (size_t i = 0; i < 3 * n; ++i)
+        mean += r->estimate.data[i];
+    mean /= 3.0 * (double)n;
+    double floor2 = 0.04 * mean * mean + 1e-30;
+    for (size_t i = 0; i < n; ++i) {
+        value[i] = 0;
+        for (size_t c = 3 * i; c < 3 * i + 3; ++c) {
+            double m = g->sum[c] / g->spp, v = (g->sum_squares[c] / g->spp - m * m) * g->spp / (g->spp - 1.0);
+            value[i] += (v > 0 ? v : 0) / ((double)r->estimate.data[c] * r->estimate.data[c] + floor2) / 3;
+        }
+    }
+    qsort(value, n, sizeof *value, compare_doubles);
+    size_t keep = n - n / 1000;
+    double sum = 0;
+    for (size_t i = 0; i < keep; ++i)
+        sum += value[i];
+    free(value);
+    return sum / (double)keep;
+}
+
+/* Weight of a group = samples / variance. Learning only lowers the variance of a sample, while an early pass of a hard
+   scene has often not seen its light yet and looks quiet: so a group counts as at least as noisy as every later one.
+   A group of a single sample has no variance to tell and counts only when it is alone. */
+static void weigh_groups(render_state *r)
+{
+    double worst = 0;
+    bool any = false;
+    for (int i = r->group_count - 1; i >= 0; --i) {
+        group *g = &r->groups[i];
+        g->variance = relative_variance(r, g);
+        g->weight = 0;
+        if (g->spp < 1 || (g->variance < 0 && r->group_count > 1))
+            continue;
+        worst = g->variance > worst ? g->variance : worst;
+        g->weight = g->spp / (worst > 1e-12 ? worst : 1e-12);
+        any = true;
+    }
+    if (!any)
+        r->groups[r->group_count - 1].weight = 1;
+}
+
+/* Combine the groups into r->combined and the variance of that mean into r->variance. */
+static void combine(render_state *r)
+{
+    size_t n = 3 * pixel_count(r);
+    double total = 0;
+    for (int i = 0; i < r->group_count; ++i)
+        total += r->groups[i].weight;
+    for (size_t c = 0; c < n; ++c) {
+        double value = 0, variance = 0;
+        for (int i = 0; i < r->group_count; ++i) {
+            const group *g = &r->groups[i];
+            if (!(g->weight > 0))
+                continue;
+            double w = g->weight / total, m = g->sum[c] / g->spp;
+            value += w * m;
+            if (g->spp > 1) {
+                double v = (g->sum_squares[c] / g->spp - m * m) / (g->spp - 1.0);
+                variance += w * w * (v > 0 ? v : 0);
+            }
+        }
+        r->combined.data[c] = (float)value;
+        r->variance.data[c] = (float)variance;
+    }
+}
+
+/* ---- >>estimate --------------------------------------------------------------------------------------------- */
+
+/* One box filter of 2 radius + 1 pixels along one axis; step and stride in floats. Shrinks at the border. */
+static void box_line(const float *in, float *out, int count, size_t stride, int radius)
+{
+    double sum = 0;
+    int lo = 0, hi = 0; /* window [lo, hi) */
+    for (int i = 0; i < count; ++i) {
+        for (; hi < count && hi <= i + radius; ++hi)
+            sum += in[(size_t)hi * stride];
+        for (; lo < i - radius; ++lo)
+            sum -= in[(size_t)lo * stride];
+        out[(size_t)i * stride] = (float)(sum / (hi - lo));
+    }
+}
+
+/* The pixel estimate: the image so far under three box filters, wider the more pixels are still black. */
+static bool estimate_pixels(render_state *r)
+{
+    int w = r->frame.width, h = r->frame.height;
+    size_t n = pixel_count(r), black = 0;
+    float *scratch = malloc(3 * n * sizeof *scratch), *out = r->estimate.data;
+    if (!scratch)
+        return false;
+    for (size_t i = 0; i < n; ++i) {
+        const float *p = r->combined.data + 3 * i;
+        black += !(p[0] + p[1] + p[2] > 0);
+    }
+    int radius = 1 + (int)(8 * (double)black / (double)n);
+    memcpy(out, r->combined.data, 3 * n * sizeof *out);
+    for (int iteration = 0; iteration < 3; ++iteration)
+        for (int c = 0; c < 3; ++c) {
+            for (int y = 0; y < h; ++y)
+                box_line(out + 3 * (size_t)y * (size_t)w + c, scratch + 3 * (size_t)y * (size_t)w + c, w, 3, radius);
+            for (int x = 0; x < w; ++x)
+                box_line(scratch + 3 * (size_t)x + c, out + 3 * (size_t)x + c, h, 3 * (size_t)w, radius);
+        }
+    free(scratch);
+    double mean = 0;
+    for (size_t i = 0; i < 3 * n; ++i) {
+        out[i] = out[i] > 0 ? out[i] : 0;
+        mean += out[i];
+    }
+    mean /= 3.0 * (double)n;
+    /* The error measure divides by sqrt(R^2 + 0.1^2) with mean(R) = 0.5: the same floor here. */
+    r->frame.estimate_floor = mean > 0 ? (float)(0.2 * mean) : 1;
+    return true;
+}
+
+/* ---- >>loop ------------------------------------------------------------------------------------------------- */
+
+static void *zalloc(size_t count, size_t size) { return calloc(count ? count : 1, size); }
+
+static bool allocate(render_state *r)
+{
+    tr_frame *f = &r->frame;
+    tr_result *res = r->result;
+    size_t n = pixel_count(r);
+    f->sum = zalloc(3 * n, sizeof(double));
+    f->sum_squares = zalloc(3 * n, sizeof(double));
+    f->alpha_count = zalloc(n, sizeof(float));
+    bool ok = f->sum && f->sum_squares && f->alpha_count;
+    struct {
+        tr_image *image;
+        int channels;
+    } images[] = {{&r->estimate, 3}, {&res->color, 3}, {&res->variance, 3}, {&res->albedo, 3},
+                  {&res->normal, 3}, {&res->alpha, 1}, {&res->cell, 1},     {&res->depth, 1}};
+    for (size_t i = 0; i < sizeof images / sizeof images[0]; ++i)
+        ok = tr_image_alloc(images[i].image, f->width, f->height, images[i].channels) && ok;
+    if (!ok)
+        return false;
+    r->combined = res->color; /* the same pixels: the combined image is the result */
+    r->variance = res->variance;
+    f->albedo = res->albedo.data;
+    f->normal = res->normal.data;
+    f->alpha = res->alpha.data;
+    f->cell = res->cell.data;
+    f->depth = res->depth.data;
+    int threads = r->settings->threads > 0 ? r->settings->threads : tr_cpu_count();
+    r->pool = tr_pool_create(threads);
+    r->workers = zalloc((size_t)threads, sizeof *r->workers);
+    r->idle = zalloc((size_t)threads, sizeof *r->idle);
+    return r->pool && r->workers && r->idle;
+}
+
+static bool allocate_workers(render_state *r)
+{
+    int threads = r->settings->threads > 0 ? r->settings->threads : tr_cpu_count();
+    for (; r->worker_count < threads; ++r->worker_count) {
+        tr_worker *w = tr_worker_create(&r->frame);
+        if (!w)
+            return false;
+        r->workers[r->worker_count] = w;
+        r->idle[r->idle_count++] = w;
+    }
+    return true;
+}
+
+static void release(render_state *r)
+{
+    for (int i = 0; i < r->worker_count; ++i)
+        tr_worker_destroy(r->workers[i]);
+    for (int i = 0; i < r->group_count; ++i) {
+        free(r->groups[i].sum);
+        free(r->groups[i].sum_squares);
+    }
+    if (r->frame.method_data)
+        r->settings->method->destroy(r->frame.method_data);
+    tr_pool_destroy(r->pool);
+    free(r->workers);
+    free(r->idle);
+    free(r->frame.sum);
+    free(r->frame.sum_squares);
+    free(r->frame.alpha_count);
+    tr_image_free(&r->estimate);
+    pthread_mutex_destroy(&r->lock);
+}
+
+static uint64_t total_guided(const render_state *r)
+{
+    uint64_t n = 0;
+    for (int i = 0; i < r->worker_count; ++i)
+        n += tr_worker_counters(r->workers[i])->guided_vertices;
+    return n;
+}
+
+/* Close a pass: its sums join the last group if both were unguided, or become a group. */
+static bool close_pass(render_state *r, int spp, bool guided)
+{
+    size_t n = 3 * pixel_count(r);
+    tr_frame *f = &r->frame;
+    group *g = r->group_count ? &r->groups[r->group_count - 1] : NULL;
+    bool join = g && (!r->settings->method->learns || (!g->guided && !guided));
+    if (!join) {
+        g = &r->groups[r->group_count];
+        g->sum = zalloc(n, sizeof(double));
+        g->sum_squares = zalloc(n, sizeof(double));
+        r->group_count++; /* even when memory is out: release frees both */
+        if (!g->sum || !g->sum_squares)
+            return false;
+        g->guided = guided;
+    }
+    for (size_t i = 0; i < n; ++i) {
+        g->sum[i] += f->sum[i];
+        g->sum_squares[i] += f->sum_squares[i];
+    }
+    g->spp += spp;
+    memset(f->sum, 0, n * sizeof *f->sum);
+    memset(f->sum_squares, 0, n * sizeof *f->sum_squares);
+    weigh_groups(r);
+    combine(r);
+    return estimate_pixels(r);
+}
+
+static void report(const render_state *r, double done, int spp, int pass)
+{
+    char text[128];
+    if (!r->settings->progress)
+        return;
+    snprintf(text, sizeof text, "pass %d, %d spp, %.1f CPU s", pass, spp, cpu_used(r));
+    r->settings->progress(r->settings->progress_user, done > 1 ? 1 : done, text);
+}
+
+/* Render one pass of up to `spp` samples; fewer where the CPU budget ends. Returns the samples taken. */
+static int run_pass(render_state *r, int pass, int spp, int done_spp, bool *out_of_time)
+{
+    const tr_settings *s = r->settings;
+    int step = samples_per_round(r), taken = 0;
+    while (taken < spp && !*out_of_time) {
+        int count = spp - taken < step ? spp - taken : step;
+        double before = cpu_used(r);
+        r->frame.describe = taken == 0;
+        render_samples(r, (uint64_t)(done_spp + taken), count);
+        taken += count;
+        double now = cpu_used(r), round = now - before;
+        *out_of_time = s->seconds > 0 && now + 0.5 * round >= s->seconds;
+        report(r, s->seconds > 0 ? now / s->seconds : (double)(done_spp + taken) / s->spp, done_spp + taken, pass);
+    }
+    return taken;
+}
+
+static bool learn(render_state *r, const tr_pass *pass)
+{
+    const tr_method *m = r->settings->method;
+    double start = tr_cpu_seconds();
+    bool ok = true;
+    if (m->wants_pixel_estimate && m->set_pixel_estimate)
+        m->set_pixel_estimate(r->frame.method_data, &r->estimate);
+    if (m->end_pass)
+        ok = m->end_pass(r->frame.method_data, pass);
+    r->update_cpu += tr_cpu_seconds() - start;
+    return ok;
+}
+
+/* Samples for pass k. A pass that would leave too little for a full next one takes the rest instead; `last` tells. */
+static int plan_pass(const render_state *r, int pass, int done_spp, double cost_per_sample, bool *last)
+{
+    const tr_settings *s = r->settings;
+    int spp = 1 << (pass < 24 ? pass : 24);
+    *last = false;
+    if (s->spp > 0) {
+        int left = s->spp - done_spp;
+        *last = spp >= left;
+        return *last ? left : spp;
+    }
+    double left = s->seconds - cpu_used(r);
+    *last = pass > 0 && cost_per_sample * spp >= left;
+    return *last ? 1 << 24 : spp;
+}
+
+static bool run_passes(render_state *r)
+{
+    const tr_settings *s = r->settings;
+    const tr_method *m = s->method;
+    tr_result *res = r->result;
+    bool out_of_time = false, ok = true;
+    double cost = 0;
+    int done = 0;
+    for (int pass = 0; pass < MAX_PASSES && !out_of_time && ok && (s->spp <= 0 || done < s->spp); ++pass) {
+        tr_pass info = {pass, 0, false, s->seconds > 0 ? cpu_used(r) / s->seconds : (double)done / s->spp};
+        info.spp = plan_pass(r, pass, done, cost, &info.last);
+        double cpu = cpu_used(r);
+        uint64_t guided_before = total_guided(r);
+        r->frame.record = m->begin_pass ? m->begin_pass(r->frame.method_data, &info) : m->record != NULL;
+        r->frame.estimate = m->wants_pixel_estimate && pass > 0 ? &r->estimate : NULL;
+        int taken = run_pass(r, pass, info.spp, done, &out_of_time);
+        done += taken;
+        info.spp = taken;
+        cost = (cpu_used(r) - cpu) / taken;
+        ok = close_pass(r, taken, total_guided(r) > guided_before);
+        if (ok && !info.last && !out_of_time)
+            ok = learn(r, &info);
+        res->pass[pass].spp = taken;
+        res->pass[pass].cpu_seconds = cpu_used(r) - cpu;
+        res->pass[pass].variance = r->groups[r->group_count - 1].variance;
+        res->passes = pass + 1;
+    }
+    res->spp = done;
+    return ok;
+}
+
+static void finish_layers(render_state *r)
+{
+    tr_result *res = r->result;
+    float scale = res->spp > 0 ? 1.0f / (float)res->spp : 0;
+    for (size_t i = 0; i < 3 * pixel_count(r); ++i) {
+        res->albedo.data[i] *= scale;
+        res->normal.data[i] *= scale;
+    }
+    for (size_t i = 0; i < pixel_count(r); ++i)
+        res->alpha.data[i] = r->frame.alpha_count[i] > 0 ? res->alpha.data[i] / r->frame.alpha_count[i] : 1;
+}
+
+/* Stage times are taken on the wall clock of each worker, cheap enough for every batch; they are scaled so that they
+   add up to the CPU time really used. */
+static bool collect(render_state *r)
+{
+    tr_result *res = r->result;
+    tr_counters sum = {0};
+    for (int i = 0; i < r->worker_count; ++i) {
+        const tr_counters *c = tr_worker_counters(r->workers[i]);
+        sum.trace += c->trace;
+        sum.record += c->record;
+        sum.query += c->query;
+        sum.total += c->total;
+        sum.rays += c->rays;
+        sum.shadow_rays += c->shadow_rays;
+        sum.paths += c->paths;
+        sum.bad_samples += c->bad_samples;
+        sum.out_of_memory |= c->out_of_memory;
+    }
+    double workers_cpu = res->cpu_seconds - r->update_cpu;
+    double scale = sum.total > 0 ? workers_cpu / sum.total : 0;
+    res->trace_seconds = sum.trace * scale;
+    res->record_seconds = sum.record * scale;
+    res->query_seconds = sum.query * scale;
+    res->update_seconds = r->update_cpu;
+    res->rays = sum.rays;
+    res->shadow_rays = sum.shadow_rays;
+    res->paths = sum.paths;
+    res->bad_samples = sum.bad_samples;
+    double total = 0;
+    for (int i = 0; i < r->group_count; ++i)
+        total += r->groups[i].weight;
+    for (int i = 0, g = 0, spp = 0; i < res->passes; ++i) {
+        res->pass[i].weight = r->groups[g].weight / total * res->pass[i].spp / r->groups[g].spp;
+        spp += res->pass[i].spp;
+        if (spp >= r->groups[g].spp && g + 1 < r->group_count)
+            ++g, spp = 0;
+    }
+    if (r->settings->method->stats)
+        r->settings->method->stats(r->frame.method_data, &res->method);
+    return !sum.out_of_memory;
+}
+
+static bool fail(char *err, size_t err_size, const char *text)
+{
+    if (err_size && !err[0])
+        snprintf(err, err_size, "%s", text);
+    return false;
+}
+
+static bool create_method(render_state *r, char *err, size_t err_size)
+{
+    const tr_settings *s = r->settings;
+    tr_method_env env = {.scene = r->frame.scene,
+                         .width = r->frame.width,
+                         .height = r->frame.height,
+                         .tiles = r->frame.tiles_x * r->frame.tiles_y,
+                         .nee = r->frame.nee,
+                         .seed = s->seed,
+                         .parallel = tr_pool_run,
+                         .parallel_user = r->pool,
+                         .options = s->options,
+                         .option_count = s->option_count};
+    r->frame.method_data = s->method->create(&env, err, err_size);
+    if (!r->frame.method_data)
+        return fail(err, err_size, "the method could not start: out of memory");
+    for (int i = 0; i < s->option_count; ++i)
+        if (!s->options[i].used) {
+            snprintf(err, err_size, "--set %s: method '%s' has no such option", s->options[i].key, s->method->name);
+            return false;
+        }
+    return true;
+}
+
+bool tr_render(const tr_scene *scene, const tr_settings *settings, tr_result *result, char *err, size_t err_size)
+{
+    render_state r;
+    memset(&r, 0, sizeof r);
+    memset(result, 0, sizeof *result);
+    if (err_size)
+        err[0] = 0;
+    pthread_mutex_init(&r.lock, NULL);
+    r.settings = settings;
+    r.result = result;
+    tr_frame *f = &r.frame;
+    f->scene = scene;
+    f->settings = settings;
+    f->method = settings->method;
+    f->width = settings->width > 0 ? settings->width : scene->width;
+    f->height = settings->height > 0 ? settings->height : scene->height;
+    f->tiles_x = (f->width + TR_TILE_W - 1) / TR_TILE_W;
+    f->tiles_y = (f->height + TR_TILE_H - 1) / TR_TILE_H;
+    f->max_depth = settings->max_depth > 0 ? settings->max_depth : scene->max_depth;
+    if (f->max_depth < 0 || f->max_depth > TR_MAX_DEPTH)
+        f->max_depth = TR_MAX_DEPTH;
+    f->nee = !settings->no_nee;
+    bool ok = settings->spp > 0 || settings->seconds > 0;
+    if (!ok)
+        fail(err, err_size, "no budget: give samples per pixel or CPU seconds");
+    if (ok && !(ok = allocate(&r)))
+        fail(err, err_size, "out of memory for the image");
+    double wall = tr_wall_seconds();
+    r.start_cpu = tr_cpu_seconds();
+    ok = ok && create_method(&r, err, err_size);
+    if (ok && !(ok = allocate_workers(&r)))
+        fail(err, err_size, "out of memory for the workers");
+    if (ok && !(ok = run_passes(&r)))
+        fail(err, err_size, "out of memory while rendering");
+    if (ok) {
+        finish_layers(&r);
+        result->cpu_seconds = cpu_used(&r);
+        result->wall_seconds = tr_wall_seconds() - wall;
+        if (!(ok = collect(&r)))
+            fail(err, err_size, "out of memory for path records");
+    }
+    release(&r);
+    if (!ok)
+        tr_result_free(result);
+    return ok;
+}
+
+void tr_result_free(tr_result *result)
+{
+    tr_image *images[] = {&result->color, &result->variance, &result->albedo, &result->normal,
+                          &result->alpha, &result->cell,     &result->depth};
+    for (size_t i = 0; i < sizeof images / sizeof images[0]; ++i)
+        tr_image_free(images[i]);
+}

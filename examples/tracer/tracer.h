@@ -1,0 +1,491 @@
+/* tracer.h: the example renderer's shared types: scene, surfaces, closures, lights, images, methods.
+
+   contents: >>log >>image >>texture >>bsdf >>shape >>light >>scene >>surface >>closure >>lightquery
+             >>vertex >>method >>render
+
+   Conventions. World space, metres; radiance in W/m^2/sr per RGB channel (linear sRGB primaries). Directions are unit
+   vectors that point away from the surface: wo towards the viewer, wi towards the light. A pdf is per steradian unless
+   its comment says otherwise. Ids are indices into the scene's arrays; -1 means none. */
+#ifndef TR_TRACER_H
+#define TR_TRACER_H
+
+#include <stdarg.h>
+#include <stdio.h>
+
+#include "embree.h"
+#include "tmath.h"
+
+/* ---- >>log -------------------------------------------------------------------------------------------------- */
+
+typedef enum tr_level { TR_NOTE, TR_WARNING, TR_ERROR } tr_level;
+
+/* Where messages about a scene go. Counted, so that a test can see that something was said; the first TR_LOG_SHOWN
+   of each level are printed to `out` (NULL = silent). `last` keeps the newest message for tests. */
+typedef struct tr_log {
+    FILE *out;
+    int notes, warnings, errors;
+    char last[512];
+} tr_log;
+#define TR_LOG_SHOWN 40
+
+/* file may be NULL; line 0 = no line. Prints "file:line: warning: text". */
+void tr_message(tr_log *log, tr_level level, const char *file, int line, const char *format, ...);
+
+/* ---- >>image ------------------------------------------------------------------------------------------------ */
+
+/* Interleaved float pixels, row 0 on top; channels 1..4 (RGB = 3). */
+typedef struct tr_image {
+    int width, height, channels;
+    float *data;
+} tr_image;
+
+/* One named group of channels to write to an EXR: names such as "R,G,B" for the main layer or "variance.R,variance.G,
+   variance.B", "albedo.R,...", "cell.Y"; one name per channel of `image`, separated by commas. */
+typedef struct tr_layer {
+    const char *names;
+    const tr_image *image;
+    bool full_float; /* write 32-bit float instead of half (cell ids need it) */
+} tr_layer;
+
+bool tr_image_alloc(tr_image *image, int width, int height,
+                    int channels); /* zeroed; false = out of memory or bad size */
+void tr_image_free(tr_image *image);
+/* Read the RGB (or Y) of an EXR (OpenEXR C core), or an LDR/HDR picture (stb_image; 8-bit files are decoded from sRGB
+   to linear unless `raw`). On failure returns false and writes a one-line reason to err. Safe against broken files. */
+bool tr_image_read(const char *path, bool raw, tr_image *image, char *err, size_t err_size);
+/* Half-float (or float) scanline EXR, ZIP compression, all layers of one size. */
+bool tr_exr_write(const char *path, const tr_layer *layers, int layer_count, char *err, size_t err_size);
+/* Tone-mapped PNG: exposure, then sRGB curve, clipped. exposure <= 0 picks one from the image's mean luminance. */
+bool tr_png_write(const char *path, const tr_image *image, float exposure, char *err, size_t err_size);
+float tr_auto_exposure(const tr_image *image);
+/* Average blocks so that `image` gets the size w x h; false unless w and h divide its size by the same whole factor. */
+bool tr_image_downsample(const tr_image *image, int w, int h, tr_image *out);
+
+/* Errors as the README states them: both images scaled by 0.5 / mean(reference), per pixel the mean over channels of
+   (I-R)^2 / (R^2 + 0.01) and |I-R| / (R + 0.01). Trimmed drops the worst 0.1 % of pixels of each measure. */
+typedef struct tr_error {
+    double relmse, mrae; /* trimmed */
+    double relmse_untrimmed, mrae_untrimmed;
+} tr_error;
+bool tr_image_error(const tr_image *image, const tr_image *reference, tr_error *error, char *err, size_t err_size);
+
+/* ---- >>texture ---------------------------------------------------------------------------------------------- */
+
+typedef enum tr_texture_type { TR_TEXTURE_BITMAP, TR_TEXTURE_CHECKERBOARD } tr_texture_type;
+typedef enum tr_wrap { TR_WRAP_REPEAT, TR_WRAP_CLAMP, TR_WRAP_MIRROR } tr_wrap;
+
+typedef struct tr_texture {
+    tr_texture_type type;
+    char *id;
+    float uv[2][3];      /* u' = uv[0] . (u, v, 1), v' = uv[1] . (u, v, 1) */
+    vec3 color0, color1; /* checkerboard: color0 where floor(2u') + floor(2v') is even */
+    tr_image image;      /* bitmap: linear RGB (3 channels); row 0 of the image is v = 1 */
+    tr_wrap wrap;
+    bool nearest; /* else bilinear */
+} tr_texture;
+
+vec3 tr_texture_eval(const tr_texture *texture, float u, float v);
+/* Derivative of the mean of channels to u and v, for bump maps. */
+void tr_texture_gradient(const tr_texture *texture, float u, float v, float *du, float *dv);
+
+/* A colour or number that may come from a texture; a number lies in value.x and a texture's mean channel. */
+typedef struct tr_param {
+    vec3 value;
+    int texture; /* -1 = constant */
+} tr_param;
+
+/* ---- >>bsdf ------------------------------------------------------------------------------------------------- */
+
+typedef enum tr_bsdf_type {
+    TR_BSDF_DIFFUSE,
+    TR_BSDF_CONDUCTOR,
+    TR_BSDF_ROUGHCONDUCTOR,
+    TR_BSDF_DIELECTRIC,
+    TR_BSDF_ROUGHDIELECTRIC,
+    TR_BSDF_THINDIELECTRIC,
+    TR_BSDF_PLASTIC,
+    TR_BSDF_ROUGHPLASTIC,
+    TR_BSDF_PHONG,
+    TR_BSDF_PBR,      /* glTF 2.0 metallic-roughness */
+    TR_BSDF_TWOSIDED, /* child[0] in front, child[1] behind (-1 = child[0]) */
+    TR_BSDF_MASK,     /* child[0] with probability opacity, else straight through */
+    TR_BSDF_BUMPMAP   /* child[0] with its normal tilted by bump_texture */
+} tr_bsdf_type;
+
+typedef enum tr_distribution { TR_BECKMANN, TR_GGX } tr_distribution;
+
+typedef struct tr_bsdf {
+    tr_bsdf_type type;
+    char *id;
+    int line;                        /* where the scene file declares it */
+    tr_param reflectance;            /* diffuse colour; PBR: base colour */
+    tr_param specular_reflectance;   /* default 1 */
+    tr_param specular_transmittance; /* default 1 */
+    tr_param alpha;                  /* microfacet roughness; PBR: perceptual roughness */
+    tr_param metallic;               /* PBR */
+    tr_param exponent;               /* phong */
+    tr_param opacity;                /* mask */
+    vec3 eta, k;                     /* conductor: complex index of refraction over that of the outside, per channel */
+    float ior;                       /* dielectric, plastic: interior over exterior index */
+    tr_distribution distribution;
+    bool nonlinear; /* plastic: colour shifts by internal scattering */
+    int child[2];
+    int bump_texture;
+    float bump_scale;
+    /* Filled by tr_bsdf_finish. */
+    float fdr_internal;    /* plastic: diffuse Fresnel reflectance from inside */
+    float *transmittance; /* rough plastic: hemispherical transmittance over cos theta, TR_TRANSMITTANCE_SIZE entries */
+    float transmittance_internal;
+} tr_bsdf;
+#define TR_TRANSMITTANCE_SIZE 64
+
+void tr_bsdf_defaults(tr_bsdf *bsdf,
+                      tr_bsdf_type type); /* Mitsuba's defaults: reflectance 0.5, alpha 0.1, BK7/air ... */
+
+/* ---- >>shape ------------------------------------------------------------------------------------------------ */
+
+/* Rectangle and cube are meshes; the others are analytic in object space: unit sphere at the origin, unit disk in
+   z = 0 with normal +z, unit cylinder around z from z = 0 to 1. */
+typedef enum tr_shape_type { TR_SHAPE_MESH, TR_SHAPE_SPHERE, TR_SHAPE_DISK, TR_SHAPE_CYLINDER } tr_shape_type;
+
+typedef struct tr_shape {
+    tr_shape_type type;
+    char *id;
+    int line;
+    int bsdf, light; /* light: -1 or the area light on this shape */
+    bool flip_normals;
+    /* Mesh, world space. Geometric normal = cross(p1 - p0, p2 - p0), turned by flip_normals. */
+    uint32_t vertex_count, triangle_count;
+    float *positions;  /* [vertex_count + 1][3]: one vertex of padding for Embree */
+    float *normals;    /* [vertex_count][3] or NULL = face normals */
+    float *uvs;        /* [vertex_count][2] or NULL */
+    uint32_t *indices; /* [triangle_count][3] */
+    /* Analytic, world space. The sphere has centre and radius (uniform scale); disk and cylinder keep the transforms.
+     */
+    mat4 object_to_world, world_to_object;
+    vec3 center;
+    float radius;
+    float area;
+    float *area_cdf; /* light meshes: [triangle_count + 1], 0 .. 1 */
+} tr_shape;
+
+/* ---- >>light ------------------------------------------------------------------------------------------------ */
+
+typedef enum tr_light_type {
+    TR_LIGHT_AREA,        /* radiance, on the front side of its shape */
+    TR_LIGHT_ENVMAP,      /* image [height][width][3] in the (theta, phi) layout of Mitsuba, turned by to_world */
+    TR_LIGHT_CONSTANT,    /* radiance from everywhere */
+    TR_LIGHT_POINT,       /* intensity W/sr at position */
+    TR_LIGHT_SPOT,        /* intensity W/sr at position along direction, falling off from beam_cos to cutoff_cos */
+    TR_LIGHT_DIRECTIONAL, /* irradiance W/m^2 along direction */
+    TR_LIGHT_SUN          /* radiance within the cone cutoff_cos around -direction: a disk that rays can hit */
+} tr_light_type;
+
+typedef struct tr_light {
+    tr_light_type type;
+    int line;
+    int shape;  /* area */
+    vec3 value; /* radiance, intensity or irradiance */
+    vec3 position;
+    vec3 direction; /* spot, directional, sun: the way the light travels */
+    float cutoff_cos, beam_cos;
+    mat4 to_world, to_local;
+    tr_image image; /* envmap, already scaled */
+    /* Filled by tr_lights_finish. */
+    float *marginal, *conditional; /* envmap: cumulative, [height + 1] and [height][width + 1] */
+    float selection;               /* probability that light sampling picks this light */
+} tr_light;
+
+/* Fill `sky` (an envmap of width x height, upper hemisphere) and `sun` from Preetham et al. 1999. sun_direction points
+   to the sun; `up` is +y unless to_world turns it. Values are in the W/m^2/sr-like units of Mitsuba's sunsky. */
+typedef struct tr_sunsky {
+    float turbidity;    /* 2 .. 10 */
+    vec3 sun_direction; /* local space, y up */
+    float sky_scale, sun_scale, sun_radius_scale;
+    vec3 albedo;
+    mat4 to_world;
+} tr_sunsky;
+bool tr_sunsky_lights(const tr_sunsky *desc, tr_light *sky, tr_light *sun); /* false = out of memory */
+/* Local (y up) direction to the sun; Mitsuba's convention: east = x, south = z. */
+vec3 tr_sun_direction(int year, int month, int day, float hour, float minute, float second, float latitude,
+                      float longitude, float timezone);
+
+/* ---- >>scene ------------------------------------------------------------------------------------------------ */
+
+typedef enum tr_filter { TR_FILTER_BOX, TR_FILTER_TENT, TR_FILTER_GAUSSIAN } tr_filter;
+
+/* Camera space as in Mitsuba: looking along +z, +y up, +x to the LEFT of the picture. */
+typedef struct tr_camera {
+    mat4 to_world;
+    float fov;      /* degrees across `fov_axis` */
+    int fov_axis;   /* 0 = x, 1 = y, 2 = diagonal, 3 = smaller, 4 = larger */
+    float aperture; /* thin lens radius, 0 = pinhole */
+    float focus;    /* distance of the focal plane */
+} tr_camera;
+
+typedef struct tr_scene {
+    char *path;
+    tr_texture *textures;
+    int texture_count;
+    tr_bsdf *bsdfs;
+    int bsdf_count;
+    tr_shape *shapes;
+    int shape_count;
+    tr_light *lights;
+    int light_count;
+    tr_camera camera;
+    int width, height;
+    tr_filter filter;
+    int max_depth; /* path edges: 1 = only emitted light seen directly, -1 = unlimited (cut at TR_MAX_DEPTH) */
+    bool hide_emitters;
+    /* Filled by tr_scene_finish. */
+    vec3 bounds_min, bounds_max;
+    float bounds_radius;
+    vec3 bounds_center;
+    int *environment; /* ids of envmap, constant and sun lights */
+    int environment_count;
+    float *light_cdf; /* [light_count + 1] */
+    uint64_t triangles;
+    RTCDevice device;
+    RTCScene rtc;
+} tr_scene;
+#define TR_MAX_DEPTH 256
+
+typedef struct tr_define {
+    const char *name, *value; /* $name in the file */
+} tr_define;
+
+/* Load a Mitsuba XML (0.5, 0.6 or 3.0 spelling) or a .gltf/.glb file and finish it (lights, Embree). threads: for
+   Embree's build, 0 = all. Returns NULL after an error was logged with file and line; warnings do not fail. */
+tr_scene *tr_scene_load(const char *path, const tr_define *defines, int define_count, int threads, tr_log *log);
+tr_scene *tr_scene_new(void); /* empty, camera and film at defaults; NULL = out of memory. For scenes built in code. */
+/* Append a zeroed element (array grown), returning its id or -1 when out of memory. */
+int tr_scene_add_texture(tr_scene *scene);
+int tr_scene_add_bsdf(tr_scene *scene, tr_bsdf_type type);
+int tr_scene_add_shape(tr_scene *scene);
+int tr_scene_add_light(tr_scene *scene, tr_light_type type);
+/* Check everything (indices in range, NaN vertices dropped with a warning, zero-area lights disabled with a warning),
+   build bounds, light tables and the Embree scene. The loader has called it; scenes built in code call it once. */
+bool tr_scene_finish(tr_scene *scene, int threads, tr_log *log);
+void tr_scene_free(tr_scene *scene);
+
+bool tr_bsdf_finish(tr_scene *scene, tr_bsdf *bsdf, tr_log *log); /* called by tr_scene_finish */
+bool tr_lights_finish(tr_scene *scene, tr_log *log);              /* called by tr_scene_finish, before Embree */
+
+/* ---- >>surface ---------------------------------------------------------------------------------------------- */
+
+/* A point on a surface. ng and ns are unit, as the shape defines its front (not turned towards the ray). */
+typedef struct tr_surface {
+    vec3 p, ng, ns;
+    vec3 dpdu, dpdv;
+    float u, v;
+    float t; /* distance along the ray */
+    int shape;
+    uint32_t prim;
+} tr_surface;
+
+/* Fill a surface from Embree's answer (ray.geomID valid). */
+void tr_surface_from_hit(const tr_scene *scene, const struct RTCRayHit *hit, tr_surface *surface);
+/* Ask the cache for what tr_surface_from_hit will read: stage 0 some hits ahead, stage 1 (needs stage 0's) nearer. */
+void tr_surface_prefetch(const tr_scene *scene, const struct RTCRayHit *hit, int stage);
+
+/* ---- >>closure ---------------------------------------------------------------------------------------------- */
+
+/* A bsdf at one point for one wo, textures and nested bsdfs resolved. A closure has a *delta part* (mirror, smooth
+   glass, mask's gap) and a *smooth part*; delta_probability is how often to sample the delta part (0 = none, 1 =
+   nothing else). Everything about the smooth part is conditional on having chosen it. */
+typedef struct tr_closure {
+    uint8_t type;         /* tr_bsdf_type, never a nesting one */
+    uint8_t distribution; /* tr_distribution */
+    uint8_t nonlinear;
+    uint8_t transmits; /* smooth part reaches the far side of the surface */
+    uint8_t bumped;    /* directions on different sides of base_n and frame.n count as blocked */
+    frame3 frame;      /* shading frame; frame.n is bumped, and turned to wo for twosided and dielectrics */
+    vec3 base_n;       /* frame.n without the bump map */
+    vec3 wo;           /* local */
+    vec3 diffuse, specular, transmitted;
+    vec3 eta, k;
+    float ior, alpha, exponent;
+    float opacity;
+    float specular_probability; /* share of the smooth part's samples given to its glossy lobe */
+    float delta_probability;
+    float gap_probability; /* mask: share of the delta part that goes straight through */
+    float roughness; /* 0 mirror .. 1 diffuse, for guiding records */
+    const tr_bsdf *bsdf;
+    /* Scratch that prepare computes once (Fresnel terms and the like). */
+    float fresnel, scratch[3];
+} tr_closure;
+
+/* wo in world space. False where nothing scatters (black, or seen from behind a one-sided bsdf). */
+bool tr_closure_prepare(const tr_scene *scene, const tr_surface *surface, vec3 wo, tr_closure *closure);
+/* Smooth part: f (1/sr, without cosine) and, where pdf is not NULL, its sampling density. wi in world space.
+   The cosine to use with f is |dot(closure->frame.n, wi)|. Zero outside its support. */
+vec3 tr_closure_eval(const tr_closure *closure, vec3 wi, float *pdf);
+/* Draw wi (world) from the smooth part; u in [0,1). False = no direction (count as zero). f, pdf as eval returns them.
+ */
+bool tr_closure_sample(const tr_closure *closure, float u_lobe, float u1, float u2, vec3 *wi, vec3 *f, float *pdf);
+/* Draw from the delta part: weight = f cos / probability of this direction within the delta part. eta_scale: square
+   of the relative index when the path refracts (1 otherwise), by which roulette corrects the throughput. */
+bool tr_closure_sample_delta(const tr_closure *closure, float u, vec3 *wi, vec3 *weight, float *eta_scale);
+vec3 tr_closure_albedo(const tr_closure *closure); /* approximate, for the albedo layer */
+
+/* ---- >>lightquery ------------------------------------------------------------------------------------------- */
+
+typedef struct tr_light_sample {
+    vec3 wi;
+    float distance; /* to the light along wi; INFINITY for the environment, sun and directional lights */
+    vec3 radiance;  /* arriving at p if nothing is between; for delta lights intensity / distance^2 or irradiance */
+    float pdf;      /* per steradian, selection included; for delta lights the selection probability */
+    bool delta;     /* no direction sampled by a bsdf or guide can hit it: no MIS */
+    int light;
+} tr_light_sample;
+
+/* Pick a light and a direction to it. False when there is none or it cannot reach p (behind the emitter). */
+bool tr_light_sample_direction(const tr_scene *scene, vec3 p, float u_select, float u1, float u2,
+                               tr_light_sample *sample);
+/* Density with which tr_light_sample_direction draws wi: hit = the light surface reached from p (area lights), NULL =
+   the environment (sum over envmap, constant and sun). 0 where hit does not emit. */
+float tr_light_pdf(const tr_scene *scene, vec3 p, vec3 wi, const tr_surface *hit);
+/* Radiance leaving an emissive surface along wo (0 for others and behind). */
+vec3 tr_surface_emission(const tr_scene *scene, const tr_surface *surface, vec3 wo);
+/* Radiance arriving from the environment along direction (pointing away from the scene). */
+vec3 tr_environment(const tr_scene *scene, vec3 direction);
+
+/* ---- >>vertex ----------------------------------------------------------------------------------------------- */
+
+/* What a guiding method learns from: one path vertex whose next direction was traced. Delta vertices are left out; L
+   passes through them. */
+typedef struct tr_vertex {
+    vec3 p, ng, ns, wo, wi;
+    float distance;   /* to the next vertex (surface), +INFINITY = the environment */
+    vec3 next_normal; /* geometric normal there, 0 for the environment */
+    vec3 L;           /* incident radiance estimate from wi: w_light Le + reflected, see README "What is recorded" */
+    vec3 f;           /* smooth bsdf, without cosine */
+    float cosine;     /* |dot(ns, wi)| */
+    float roughness;
+    float pdf_mix, pdf_bsdf, pdf_guide; /* per steradian; pdf_mix = alpha pdf_bsdf + (1 - alpha) pdf_guide. All three
+                                           hold the probability of taking the smooth part; pdf_guide 0 = not asked */
+    float alpha;                        /* probability of bsdf sampling used here */
+    vec3 pixel_weight;                  /* throughput before this vertex (all pdfs and roulette in) / pixel estimate */
+    float u;                            /* time or wavelength feature in [0, 1) */
+    uint32_t flags;                     /* TR_VERTEX_... */
+} tr_vertex;
+#define TR_VERTEX_REJECTED 1u /* the direction was refused before tracing: f = 0, L = 0 */
+#define TR_VERTEX_FIRST 2u    /* first non-delta vertex seen by the camera */
+
+/* ---- >>method ----------------------------------------------------------------------------------------------- */
+
+typedef void (*tr_range_fn)(void *context, uint32_t begin, uint32_t end);
+/* Calls fn on disjoint ranges covering [0, count) from several threads and returns when all are done. */
+typedef void (*tr_parallel_fn)(void *user, uint32_t count, uint32_t grain, tr_range_fn fn, void *context);
+
+typedef struct tr_option {
+    const char *key, *value; /* from --set key=value */
+    bool used;               /* a method marks what it understood; the rest is an error */
+} tr_option;
+
+typedef struct tr_method_env {
+    const tr_scene *scene;
+    int width, height;
+    int tiles; /* streams that record is called with: 0 .. tiles - 1 */
+    bool nee;
+    uint64_t seed;
+    tr_parallel_fn parallel;
+    void *parallel_user;
+    tr_option *options;
+    int option_count;
+} tr_method_env;
+
+typedef struct tr_pass {
+    int index, spp;
+    bool last;    /* nothing after it will use what it records */
+    float budget; /* share of the budget spent before this pass, 0 .. 1 */
+} tr_pass;
+
+/* A batch of vertices to look up; arrays of n. */
+typedef struct tr_lookup {
+    int n;
+    const vec3 *p, *ns, *wo;
+    const float *roughness;
+    const float (*u)[3]; /* random numbers in [0,1)^3 for stochastic lookup */
+} tr_lookup;
+
+typedef struct tr_method_stats {
+    uint64_t samples, refused, cells, bytes;
+    double extra_bytes; /* streams and scratch at their peak */
+    char json[2048];    /* method-specific members, without braces; may be empty */
+} tr_method_stats;
+
+/* A guiding method. Handles are plain data of handle_size bytes, found once a vertex and asked many times. Every
+   function but find, sample, pdf and record (one stream per thread at a time) is called by one thread. NULL entries are
+   allowed everywhere but create and destroy: a method without find never guides. */
+typedef struct tr_method {
+    const char *name, *summary;
+    size_t handle_size;
+    bool learns; /* passes differ: combine them by variance instead of by spp */
+    void *(*create)(tr_method_env *env, char *err, size_t err_size);
+    void (*destroy)(void *method);
+    /* false = this pass needs no records (nothing to learn any more). */
+    bool (*begin_pass)(void *method, const tr_pass *pass);
+    /* Fill handles[i] and alpha[i], the probability of bsdf sampling; 1 = do not guide here. */
+    void (*find)(void *method, const tr_lookup *lookup, void *handles, float *alpha);
+    /* For the handles listed in index[0..n): direction and its density. pdf 0 = none. */
+    void (*sample)(void *method, int n, const int *index, const void *handles, const float (*u)[2], vec3 *wi,
+                   float *pdf);
+    /* Density of wi[index[i]] under handles[index[i]], to pdf[index[i]]. */
+    void (*pdf)(void *method, int n, const int *index, const void *handles, const vec3 *wi, float *pdf);
+    bool (*record)(void *method, int tile, const tr_vertex *vertices, int n); /* false = out of memory */
+    bool (*wants_records)(void *method, int tile);       /* false = this tile's records are not needed in this pass */
+    void (*flush)(void *method);                         /* take in what the tiles recorded */
+    bool (*end_pass)(void *method, const tr_pass *pass); /* learn; false = out of memory */
+    void (*describe)(void *method, int n, const void *handles, float *cell, float *depth); /* for the picture layers */
+    void (*set_pixel_estimate)(void *method, const tr_image *estimate);
+    bool wants_pixel_estimate;
+    bool (*wants_photons)(void *method);
+    bool (*record_photons)(void *method, const tr_vertex *photons, int n);
+    void (*stats)(void *method, tr_method_stats *stats);
+} tr_method;
+
+const tr_method *tr_method_find(const char *name); /* NULL = unknown */
+const tr_method *const *tr_method_list(void);      /* NULL-terminated */
+
+/* ---- >>render ----------------------------------------------------------------------------------------------- */
+
+typedef enum tr_roulette { TR_ROULETTE_OFF, TR_ROULETTE_THROUGHPUT } tr_roulette;
+
+typedef struct tr_settings {
+    int width, height; /* 0 = the scene's */
+    int spp;           /* budget in samples per pixel, or 0 */
+    double seconds;    /* budget in CPU seconds over all threads, or 0 */
+    int max_depth;     /* 0 = the scene's */
+    bool no_nee;
+    bool no_bsdf_hits; /* emission counts only through NEE (for tests: NEE-only) */
+    tr_roulette roulette;
+    int threads; /* 0 = all */
+    uint64_t seed;
+    const tr_method *method;
+    tr_option *options;
+    int option_count;
+    /* called between rounds with the share done (0 .. 1) and text; NULL = silent */
+    void (*progress)(void *user, double done, const char *text);
+    void *progress_user;
+} tr_settings;
+
+typedef struct tr_result {
+    tr_image color, variance, albedo, normal, alpha, cell, depth; /* variance: of the pixel mean */
+    int spp, passes;
+    double cpu_seconds, wall_seconds;
+    double trace_seconds, record_seconds, update_seconds, query_seconds; /* CPU seconds, of which shading is the rest */
+    uint64_t rays, shadow_rays, paths;
+    uint64_t bad_samples; /* NaN or infinite contributions dropped */
+    tr_method_stats method;
+    struct tr_pass_result {
+        int spp;
+        double weight, variance, cpu_seconds;
+    } pass[32];
+} tr_result;
+
+bool tr_render(const tr_scene *scene, const tr_settings *settings, tr_result *result, char *err, size_t err_size);
+void tr_result_free(tr_result *result);
+
+#endif

@@ -1,0 +1,3690 @@
+/* guide_sdtree.h 0.1: path guiding with a spatial tree of directional quadtrees (SD-tree). Licence: MIT or Unlicense.
+
+   In exactly one file, before including it:        #define GSD_IMPLEMENTATION
+   Everywhere else only:                            #include "guide_sdtree.h"
+
+   A path tracer samples directions better when it knows where light comes from. This header learns that while
+   rendering: record radiance samples, accumulate, refine, then ask for directions and their densities. C99 or C++11,
+   C standard library only (link with -lm).
+
+       #define GSD_IMPLEMENTATION
+       #include "guide_sdtree.h"
+       int main(void)
+       {
+           static gsd_desc desc; // zero: all defaults; the box 0 .. 1
+           gsd_field *field;
+           gsd_stream *stream;
+           desc.bounds_max[0] = desc.bounds_max[1] = desc.bounds_max[2] = 1;
+           if (gsd_create(&desc, &field) || gsd_stream_create(field, &stream))
+               return 1;
+           for (unsigned pass = 0, state = 1; pass < 6; ++pass) { // a pass: trace with the field, then learn
+               gsd_view view = gsd_get_view(field);
+               for (int i = 0; i < (1000 << pass); ++i) { // "trace": a lamp of radiance 100 around +x
+                   float p[3] = {0.5f, 0.5f, 0.5f}, d[3], u[2];
+                   for (int k = 0; k < 2; ++k)
+                       u[k] = (float)((state = state * 1664525u + 1013904223u) >> 8) / 16777216.0f;
+                   gsd_handle handle = gsd_find(&view, p, NULL);
+                   float pdf = gsd_sample(&view, &handle, u, d), L = d[0] > 0.95f ? 100.0f : 1.0f;
+                   gsd_training_sample sample = gsd_make_scalar_sample(p, d, L, L, L, pdf, pdf, 0);
+                   gsd_record(stream, &sample, 1);
+               }
+               gsd_accumulate(field, &stream, 1, NULL, NULL);
+               gsd_stream_clear(stream);
+               gsd_refine(field, NULL, NULL, NULL);
+           }
+           return gsd_stream_destroy(stream), gsd_destroy(field), 0;
+       }
+
+   CONTENTS (search for the tag)
+     >>config    macros, versions              >>query   inline: find, sample, pdf
+     >>types     descriptor, sample, results   >>batch   find, sample, pdf of arrays
+     >>field     create, refine, stats         >>store   save, load, merge, export, import
+     implementation:
+     >>memory  >>math  >>streams  >>trees  >>accumulate  >>gate  >>refine  >>block  >>forest  >>batches  >>files  >>licence
+
+   HOW IT WORKS
+     Space is a binary tree over a cube: axes in turn, cut in the middle, a leaf (*cell*) splits when it saw more than
+     c sqrt(2^k) samples. Every cell has a quadtree over directions (z, phi), equal-area, that refines where a node
+     holds more than rho of the mass [Mueller 2017]. A field has a *sampling part*, one flat relocatable block that
+     queries read and only refine (and import, load, gsd_forest_split) replaces, and a *building part* that accumulate
+     writes. Density of a direction: (1 - e) learned + e/(4 pi), e = 0.01 (desc.uniform); it integrates to 1.
+     Directions are unit, world space, away from the surface towards the light. phi = atan2(y, x) in [0, 2 pi).
+
+     What is learned (desc.target); p = pdf_mix, the density the direction was drawn with:
+       radiance        mass of a leaf = sum of L / p                                              [Mueller 2017]
+       simple          sqrt(solid angle * sum of (contribution * w)^2 / p)                        [Rath 2020]
+       variance-aware  the same with pixel_contribution                                           [Rath 2020]
+       switching       simple in passes 0..3, variance-aware from pass 4 (desc.switch_pass); sums cleared between
+     w = (1 - a) pdf_guide / (a pdf_bsdf + (1 - a) pdf_guide), a = the cell's alpha, but 0.5 where the cell did not
+     guide; desc.no_guide_weight sets w = 1.
+
+     Selection probability: handle.alpha is the probability to sample the BSDF; 1 means: do not guide here. The caller
+     draws from the BSDF with alpha, else from gsd_sample, and divides by alpha pdf_bsdf + (1 - alpha) gsd_pdf.
+
+     Gate: guiding is used in a cell until its own samples show that it does not pay, V(1) / V(a) - 1 < gate_margin
+     where V(a) = mean of contribution^2 / (p p_a), p_a = a pdf_bsdf + (1 - a) pdf_guide. Samples of a pass judge the
+     tree built from earlier passes. A verdict needs 95 % confidence and many non-zero samples; closed cells are tried
+     again every gate_probe passes and need more to open than to close. Cells without a verdict guide.
+
+   THE SAMPLE
+     One per non-delta path vertex whose direction was traced. radiance L: from that direction, no cosine, no BSDF, not
+     divided by a pdf; light that next-event estimation can sample weighted by its MIS weight; connections of this
+     vertex not included. Zeros count: record them. gsd_make_sample fills one from RGB arrays. A direction rejected
+     before tracing (f = 0) has radiance GSD_REJECTED (-0.0f): it counts as a visit and as a zero for the second-moment
+     targets and the gate. pdf_guide = 0 means "not evaluated"; the field evaluates it where it needs it.
+     A vertex that was recorded counts as a read of its cell; cells without new samples are left alone by refine.
+
+   OPTIONS: see gsd_desc. gsd_resolve fills in defaults, gsd_get_desc returns what a field uses.
+
+   MEMORY
+     Sampling part: 16 bytes per quadtree node, 32 per cell, 28 per quadtree, 256 per quadtree of more than 64 nodes
+     (a table that skips three levels), 12 per leaf with desc.alias, 4 per spatial node, and 16 KB.
+     Building part: 12 bytes per quadtree node, sizeof(gsd_cell_state) (below 600) per cell.
+     max_bytes bounds the peak of both parts while refine runs, old and new together: trees coarsen and cells stop
+     splitting; it never fails. Streams (48 bytes per sample) and the scratch of accumulate (at most 12 MB and 8 bytes
+     per cell, kept for the next call) come on top. Allocation happens in create, stream_create, record, accumulate, refine, import, load,
+     gsd_forest_split; never in a query. Stack: below 16 KB per call.
+
+   THREADS: each function has a tag.
+     [any thread]   pure function on constant data
+     [per stream]   different streams at the same time from different threads; one stream by one thread at a time
+     [exclusive]    nothing else on this field at the same time
+     No threads are started. Functions that take a gsd_parallel_fn cut work by count and let the callback run it
+     (NULL = serially). The result is bit-identical for any number of threads and for any cut of the same sequence of
+     samples into streams and accumulate calls.
+
+   ERRORS
+     gsd_result, 0 = ok; gsd_result_string says which field to change. Asserts (GSD_ASSERT) catch programming errors.
+     Bad samples (NaN, infinity, negative, >= 1e30, pdf_mix <= 0, zero direction) are refused and counted in gsd_stats;
+     positions outside the bounds are clamped and counted. A failed allocation leaves the field as it was before the
+     call, except that accumulate has lost the samples it was given (counted).
+     gsd_load checks size, version, byte order, checksum and every index before use.
+
+   NUMERICAL LIMITS
+     Quadtree depth <= 20 (default 16). Directions are quantised to 24 bits an axis; u is read to 24 bits and 8 more are
+     filled with a hash of u, so that small leaves are covered densely. A float direction can land in a neighbour leaf
+     after rounding (depth 20: 2 %, depth 12: 0.006 %): gsd_sample returns the density of the rounded direction, the
+     same as gsd_pdf for it. phi is computed to 4e-8 rad. SIMD levels differ from scalar by <= 2e-6 relative, and by the
+     neighbour's density for about 1e-6 of directions within rounding of a leaf's edge. accumulate and refine use one
+     code path for all levels.
+
+   REFERENCES
+     T. Mueller, M. Gross, J. Novak 2017, Practical Path Guiding for Efficient Light-Transport Simulation.
+     T. Mueller 2019, "Practical Path Guiding" in Production, ch. 10 of SIGGRAPH course Path Guiding in Production.
+     A. Rath, P. Grittmann, S. Herholz, P. Vevoda, P. Slusallek, J. Krivanek 2020, Variance-Aware Path Guiding.
+     A. Walker 1977, An Efficient Method for Generating Discrete Random Variables with General Distributions (alias).
+     D. Kingma, J. Ba 2015, Adam. */
+#ifndef GUIDE_SDTREE_H
+#define GUIDE_SDTREE_H
+
+/* ---- >>config ----------------------------------------------------------------------------------------------- */
+
+#include <math.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#define GSD_VERSION 1 /* of the saved format */
+
+#ifndef GSD_API /* linkage of the functions; e.g. static */
+#define GSD_API extern
+#endif
+#ifndef GSD_QUERY /* qualifiers of the inline queries; e.g. __device__ static inline */
+#define GSD_QUERY static inline
+#endif
+/* Other macros, read by the implementation only: GSD_ASSERT(x), GSD_MALLOC(n), GSD_FREE(p), GSD_NO_SIMD. */
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* ---- >>types ------------------------------------------------------------------------------------------------ */
+
+/* Results and their messages. */
+#define GSD_RESULTS(X)                                                                                                 \
+    X(GSD_OK, "ok")                                                                                                    \
+    X(GSD_OUT_OF_MEMORY, "out of memory: lower desc.max_bytes or check desc.allocate")                                 \
+    X(GSD_BAD_BOUNDS, "desc.bounds_min must lie below desc.bounds_max, both finite")                                   \
+    X(GSD_BAD_OPTION, "an enum in the descriptor is out of range: desc.target, .spatial_filter, .alpha_mode, .simd")   \
+    X(GSD_BAD_RANGE, "a number in the descriptor is out of its range: see the comments of gsd_desc")                   \
+    X(GSD_BAD_ALLOCATOR, "set both desc.allocate and desc.release or neither")                                         \
+    X(GSD_BAD_CELL, "no such cell: see gsd_cell_count")                                                                \
+    X(GSD_BAD_TREE, "an imported tree is not a tree, too deep (desc.max_depth) or has a bad value")                    \
+    X(GSD_NOT_A_FOREST, "cells can only be given or split when desc.forest_cells > 0")                                 \
+    X(GSD_MISMATCH, "the fields' structures differ: merge between accumulate and refine, from one common ancestor")    \
+    X(GSD_BUFFER_TOO_SMALL, "the buffer is too small: ask the _bound function")                                        \
+    X(GSD_BAD_FILE, "not a saved field, or it is damaged")                                                             \
+    X(GSD_BAD_VERSION, "saved by another version or on a machine of other byte order")                                 \
+    X(GSD_CORRUPT, "the field does not hold together: memory was overwritten")
+
+#define GSD_RESULT_ENUM(name, text) name,
+typedef enum gsd_result { GSD_RESULTS(GSD_RESULT_ENUM) GSD_RESULT_COUNT } gsd_result;
+#undef GSD_RESULT_ENUM
+
+typedef enum gsd_target {
+    GSD_TARGET_DEFAULT, /* = GSD_TARGET_SWITCHING */
+    GSD_TARGET_RADIANCE,
+    GSD_TARGET_SIMPLE,
+    GSD_TARGET_VARIANCE,
+    GSD_TARGET_SWITCHING
+} gsd_target;
+
+typedef enum gsd_spatial_filter {
+    GSD_SPATIAL_DEFAULT,   /* = GSD_SPATIAL_NEAREST */
+    GSD_SPATIAL_NEAREST,   /* a sample goes to the cell it lies in */
+    GSD_SPATIAL_STOCHASTIC /* to the cell of its position jittered by the size of its cell [Mueller 2019] */
+} gsd_spatial_filter;
+
+typedef enum gsd_directional_filter {
+    GSD_DIRECTIONAL_DEFAULT, /* = GSD_DIRECTIONAL_BOX */
+    GSD_DIRECTIONAL_NEAREST, /* a sample goes to the leaf it lies in */
+    GSD_DIRECTIONAL_BOX      /* spread over a box of its leaf's size, across phi's seam and the poles [Mueller 2019] */
+} gsd_directional_filter;
+
+typedef enum gsd_alpha_mode {
+    GSD_ALPHA_DEFAULT, /* = GSD_ALPHA_GRID */
+    GSD_ALPHA_FIXED,   /* stays desc.alpha */
+    GSD_ALPHA_ADAM,    /* Adam on the KL divergence (radiance) or second moment (other targets) [Mueller 2019] */
+    GSD_ALPHA_GRID     /* minimum of V(a) through the gate's estimates at five values of a, pulled towards desc.alpha */
+} gsd_alpha_mode;
+
+typedef enum gsd_simd { GSD_SIMD_AUTO, GSD_SIMD_SCALAR, GSD_SIMD_AVX2, GSD_SIMD_AVX512 } gsd_simd;
+
+/* Zero-initialise it; zero means the default. Fields named no_x switch a default behaviour off. */
+typedef struct gsd_desc {
+    float bounds_min[3], bounds_max[3]; /* world-space box of the positions; made a cube and 0.1 % larger */
+    gsd_target target;
+    uint32_t switch_pass;  /* switching: first variance-aware pass, 1 .. 1000; default 4 (passes 0..3 have 15 spp) */
+    float split_samples;   /* c, samples a cell holds before it splits, 16 .. 1e9; default 4000 */
+    float rho;             /* share of a quadtree's mass above which a node is divided, 1e-5 .. 1; default 0.01 */
+    uint32_t max_depth;    /* of quadtrees, 1 .. 20; default 16 */
+    uint32_t max_levels;   /* of the spatial tree (3 levels halve all axes), 1 .. 60; default 48 */
+    uint32_t min_samples;  /* a cell with fewer new samples waits for more before its tree is rebuilt; default 64 */
+    uint64_t max_bytes;    /* memory cap, see MEMORY; >= 65536; default 2^30 */
+    gsd_spatial_filter spatial_filter;
+    gsd_directional_filter directional_filter;
+    gsd_alpha_mode alpha_mode;
+    float alpha;            /* start value (and fixed value) of the probability of BSDF sampling, 0.05 .. 1; default 0.5 */
+    float uniform;          /* e, share of uniform sampling in the guide's density, 1e-4 .. 1; default 0.01 */
+    bool no_gate;           /* guide in every cell */
+    bool no_guide_weight;   /* second-moment targets: w = 1 */
+    bool no_history;        /* clear the sums in every refine. Otherwise a cell whose pass brought less than 1.5 times
+                               the samples it held keeps half of its sums: passes of equal size then add up */
+    bool alias;             /* build alias tables: sampling in constant time, but not monotone in u; + 12 bytes a leaf */
+    float gate_margin;      /* gain V(1)/V(a) - 1 below which guiding does not pay, 0.001 .. 10; default 0.15 */
+    uint32_t gate_probe;    /* passes between tries of a closed cell, 1 .. 1000; default 1 */
+    uint32_t forest_cells;  /* > 0: no spatial tree; that many cells, which the caller addresses by index */
+    gsd_simd simd;          /* pin the level of the batch queries; default: the best that this machine has */
+    void *(*allocate)(void *user, size_t size); /* default malloc; NULL on failure; 16-byte aligned */
+    void (*release)(void *user, void *pointer); /* default free; pointer may be NULL */
+    void *user;
+} gsd_desc;
+
+/* What is learned from one path vertex. 48 bytes. See THE SAMPLE; pdfs in 1/sr, L in W/m^2/sr. */
+typedef struct gsd_training_sample {
+    float position[3];
+    float direction[3];       /* unit */
+    float radiance;           /* mean over channels of L; GSD_REJECTED */
+    float contribution;       /* mean over channels of f L cos */
+    float pixel_contribution; /* mean over channels of f L cos * throughput before this vertex / pixel estimate */
+    float pdf_mix;            /* what the direction was drawn with */
+    float pdf_bsdf;
+    float pdf_guide; /* 0 = not evaluated */
+} gsd_training_sample;
+#define GSD_REJECTED (-0.0f)
+
+/* Optional facts about the pass that refine ends. */
+typedef struct gsd_pass {
+    uint32_t spp; /* samples per pixel of the pass: k = log2(spp / spp of the first pass); 0 = k from recorded samples */
+} gsd_pass;
+
+typedef void (*gsd_range_fn)(void *context, uint32_t begin, uint32_t end);
+/* Calls fn on disjoint ranges that cover [0, count), of about grain, and returns when all are done. */
+typedef void (*gsd_parallel_fn)(void *user, uint32_t count, uint32_t grain, gsd_range_fn fn, void *context);
+
+typedef struct gsd_field gsd_field;
+typedef struct gsd_stream gsd_stream;
+
+/* Counters since create unless they say otherwise. */
+typedef struct gsd_stats {
+    uint64_t samples;       /* accepted by accumulate */
+    uint64_t zeros;         /* of which radiance or contribution was 0 */
+    uint64_t rejected;      /* of which GSD_REJECTED */
+    uint64_t refused;       /* bad samples; best 0 */
+    uint64_t clamped;       /* positions outside the bounds; best 0 */
+    uint64_t lost;          /* samples that met a failed allocation; best 0 */
+    uint32_t passes;        /* calls of refine */
+    uint32_t cells;         /* now */
+    uint32_t trees;         /* distinct quadtrees in the sampling part now (cells share after a split) */
+    uint64_t nodes;         /* quadtree nodes in the sampling part now */
+    uint64_t leaves;        /* of which leaves */
+    uint64_t building_nodes;
+    uint64_t bytes;         /* sampling and building part now */
+    uint64_t peak_bytes;    /* most held at once by both, old and new; <= max_bytes */
+    uint32_t max_depth;     /* deepest leaf now */
+    float mean_depth;       /* mean leaf depth weighted by mass; 0 = nothing learned */
+    float effective_rho;    /* rho of the last refine, above desc.rho where max_bytes forced it; best desc.rho */
+    uint32_t split_cells;   /* by the last refine */
+    uint32_t rebuilt_trees; /* last refine: cells with new samples */
+    uint32_t waiting_cells; /* last refine: too few new samples, tree kept */
+    uint32_t unread_cells;  /* last refine: no new samples: no work done */
+    uint32_t open_cells;    /* gate: guiding shown to pay */
+    uint32_t closed_cells;  /* gate: shown not to pay; alpha = 1 */
+    uint32_t unjudged_cells; /* gate: guiding, no verdict yet */
+    uint64_t opened, closed; /* verdicts so far */
+    uint64_t probed;        /* cells tried again so far */
+    float closed_share;     /* share of the last pass's samples in closed cells, 0 .. 1 */
+    float mean_alpha;       /* over the last pass's samples, closed cells as 1 */
+} gsd_stats;
+
+/* ---- flat data of the sampling part (for queries and ports; not to be changed by callers) */
+
+/* 16 bytes. Inner: children child .. child + 3, number = (phi half) + 2 (z half); split[0] = share of the lower phi
+   half, split[1], split[2] = share of the lower z half in the lower, upper phi half. Leaf: child = 0; pdf in 1/sr, final;
+   x = lowest phi coordinate (24 bits) + depth << 24, y = lowest z coordinate (24 bits). */
+typedef union gsd_node {
+    struct gsd_inner {
+        uint32_t child;
+        float split[3];
+    } inner;
+    struct gsd_leaf {
+        uint32_t child;
+        float pdf;
+        uint32_t x, y;
+    } leaf;
+} gsd_node;
+
+/* 12 bytes. Slot i holds the leaf `node` with probability threshold, else the leaf `other`. */
+typedef struct gsd_alias {
+    float threshold;
+    uint32_t node, other;
+} gsd_alias;
+
+/* 32 bytes: what a query knows about a cell. */
+typedef struct gsd_cell {
+    uint32_t root;        /* node of its quadtree; 0 = uniform */
+    uint32_t jump;        /* into the table of jumps; 0 = none */
+    uint32_t alias;       /* into the alias slots */
+    uint32_t alias_count; /* 0 = none */
+    float alpha;
+    uint32_t tree;  /* index of its quadtree */
+    uint32_t level; /* in the spatial tree */
+    uint32_t gate;  /* GSD_GATE_... */
+} gsd_cell;
+enum { GSD_GATE_UNJUDGED, GSD_GATE_OPEN, GSD_GATE_CLOSED };
+
+/* Pointers into one sampling part. Valid until the next exclusive call. */
+typedef struct gsd_view {
+    const uint32_t *grid;    /* [16][16][16]: links, see spatial */
+    const uint32_t *spatial; /* link of each node: GSD_CELL_BIT + cell, or index of the first of two children */
+    const gsd_cell *cells;
+    const gsd_node *nodes; /* nodes[0] is the uniform leaf */
+    const uint32_t *jumps; /* [8][8] per table: node at depth 3 or the leaf above */
+    const gsd_alias *aliases;
+    float origin[3], scale; /* grid coordinate (24 bits an axis) = (position - origin) * scale */
+    float uniform;
+    uint32_t cell_count;
+    uint32_t simd; /* gsd_simd, resolved */
+} gsd_view;
+#define GSD_CELL_BIT 0x80000000u
+
+/* What find gives: plain data, 24 bytes, valid as long as the view. */
+typedef struct gsd_handle {
+    uint32_t cell, root, jump, alias, alias_count;
+    float alpha; /* probability of BSDF sampling; 1 = do not guide */
+} gsd_handle;
+
+/* ---- >>field ------------------------------------------------------------------------------------------------ */
+
+/* Message that names what to change. [any thread] */
+GSD_API const char *gsd_result_string(gsd_result result);
+
+/* Check desc and write it with all defaults filled in to resolved (may be desc itself). [any thread] */
+GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved);
+
+/* An untrained field: uniform density, alpha = desc.alpha. *field = NULL on failure. [any thread] */
+GSD_API gsd_result gsd_create(const gsd_desc *desc, gsd_field **field);
+GSD_API void gsd_destroy(gsd_field *field); /* NULL is fine; streams are destroyed separately. [exclusive] */
+GSD_API const gsd_desc *gsd_get_desc(const gsd_field *field); /* resolved. [any thread] */
+GSD_API gsd_view gsd_get_view(const gsd_field *field);        /* for the queries. [any thread] */
+GSD_API uint32_t gsd_cell_count(const gsd_field *field);      /* [any thread] */
+
+/* A buffer of samples, one per image tile or batch, so that its content does not depend on threads. Grows in chunks,
+   never copies. Must be destroyed before or after the field, with the same allocator alive. [any thread] */
+GSD_API gsd_result gsd_stream_create(const gsd_field *field, gsd_stream **stream);
+GSD_API void gsd_stream_destroy(gsd_stream *stream);        /* [per stream] */
+GSD_API void gsd_stream_clear(gsd_stream *stream);          /* keeps its memory. [per stream] */
+GSD_API uint64_t gsd_stream_size(const gsd_stream *stream); /* samples held. [per stream] */
+
+/* Append. On GSD_OUT_OF_MEMORY the samples that did not fit are lost and counted; the stream stays usable.
+   [per stream] */
+GSD_API gsd_result gsd_record(gsd_stream *stream, const gsd_training_sample *samples, uint32_t count);
+/* The same for a forest: cells[i] is the cell of samples[i]; positions are ignored. [per stream] */
+GSD_API gsd_result gsd_record_cells(gsd_stream *stream, const uint32_t *cells, const gsd_training_sample *samples,
+                                    uint32_t count);
+
+/* Add the samples of streams[0], streams[1], ... in this order to the building part. May be called many times a pass.
+   Clear the streams afterwards. On GSD_OUT_OF_MEMORY the samples not yet added are lost and counted. [exclusive] */
+GSD_API gsd_result gsd_accumulate(gsd_field *field, gsd_stream *const *streams, uint32_t count,
+                                  gsd_parallel_fn parallel, void *user);
+/* A pass has ended: rebuild the sampling part from what accumulate gathered, adapt the structure for the next pass.
+   pass may be NULL. Handles and views become invalid. On failure nothing changes; it may be called again.
+   [exclusive] */
+GSD_API gsd_result gsd_refine(gsd_field *field, const gsd_pass *pass, gsd_parallel_fn parallel, void *user);
+
+/* Share of image tiles (or paths) that are worth recording in the next pass: 1 while much of the field guides or has
+   no verdict, down to 1/16 when nearly all of it is closed: enough to notice changes. [any thread] */
+GSD_API float gsd_record_fraction(const gsd_field *field);
+/* True when no cell guides: a renderer may skip every query until the next refine. [any thread] */
+GSD_API bool gsd_all_closed(const gsd_field *field);
+
+GSD_API void gsd_get_stats(const gsd_field *field, gsd_stats *stats); /* [any thread] */
+/* Check every index and sum of both parts: GSD_OK or GSD_CORRUPT. [any thread] */
+GSD_API gsd_result gsd_validate(const gsd_field *field);
+
+/* Forest: cell `parent` was split into child_a and child_b (one of which may be parent itself); both start with its
+   quadtree and half of its sums. Indices up to 2^26; cells between are created uniform. [exclusive] */
+GSD_API gsd_result gsd_forest_split(gsd_field *field, uint32_t parent, uint32_t child_a, uint32_t child_b);
+
+/* ---- >>store ------------------------------------------------------------------------------------------------ */
+
+/* Bytes that gsd_save writes at most. [any thread] */
+GSD_API size_t gsd_save_bound(const gsd_field *field);
+/* Write both parts, so that training can go on after load. *size = bytes written. [any thread] */
+GSD_API gsd_result gsd_save(const gsd_field *field, void *data, size_t capacity, size_t *size);
+/* Restore. Options come from the save; desc (may be NULL) gives the allocator and the simd level. The data need not be
+   aligned and may come from an untrusted source. *field = NULL on failure. [any thread] */
+GSD_API gsd_result gsd_load(const gsd_desc *desc, const void *data, size_t size, gsd_field **field);
+
+/* Equal for fields whose building parts have the same cells and quadtrees. Changes in refine. [any thread] */
+GSD_API uint64_t gsd_structure_id(const gsd_field *field);
+/* Add source's building sums (since the last refine) to field's; GSD_MISMATCH unless their structure ids are equal.
+   [exclusive] on field, source is only read. */
+GSD_API gsd_result gsd_merge(gsd_field *field, const gsd_field *source);
+
+/* One quadtree as plain arrays: for each inner node (a tree that is one leaf has one inner node with four equal leaves)
+   child[4]: index of an inner node, 0 = leaf; value[4]: mass of each child. Node 0 is the root; children come later
+   than parents. Child number as in gsd_node. */
+typedef struct gsd_tree {
+    uint32_t cell;
+    uint32_t count;    /* inner nodes */
+    uint32_t *child;   /* [count][4] */
+    float *value;      /* [count][4] */
+} gsd_tree;
+typedef enum gsd_part {
+    GSD_PART_SAMPLING, /* learned density, without the uniform share; value sums to 1 over the leaves */
+    GSD_PART_BUILDING  /* masses gathered since the last refine (root masses for second-moment targets) */
+} gsd_part;
+/* Inner nodes that gsd_export_tree writes for this cell; 0 = no such cell. [any thread] */
+GSD_API uint32_t gsd_export_bound(const gsd_field *field, gsd_part part, uint32_t cell);
+/* Fill tree->child and ->value, which hold tree->count nodes, for tree->cell; sets tree->count. [any thread] */
+GSD_API gsd_result gsd_export_tree(const gsd_field *field, gsd_part part, gsd_tree *tree);
+/* Replace the sampling trees of the cells named in trees[0..count); values of leaves count, those of inner nodes are
+   ignored. Masses must be finite and >= 0; all zero = uniform. All or none are replaced. Building trees stay. The next
+   refine builds anew from samples. [exclusive] */
+GSD_API gsd_result gsd_import_trees(gsd_field *field, const gsd_tree *trees, uint32_t count);
+
+/* ---- >>query ------------------------------------------------------------------------------------------------ */
+
+#define GSD_INV_4PI 0.07957747154594766788f
+
+/* Direction (unit, any finite) to 24-bit coordinates: x = phi / (2 pi), y = (z + 1) / 2. Polynomial: minimax fit of
+   atan(t) / (2 pi) on 0 .. 1, error 6e-9 turns. Total function: NaN gives some valid coordinate. [any thread] */
+GSD_QUERY void gsd_coordinates(const float direction[3], uint32_t *x, uint32_t *y)
+{
+    float dx = direction[0], dy = direction[1], z = direction[2];
+    float ax = fabsf(dx), ay = fabsf(dy);
+    float big = ax > ay ? ax : ay, small = ax > ay ? ay : ax;
+    float t = big > 0 ? small / big : 0, s = t * t, p;
+    int32_t i;
+    p = -0.0006452896099f;
+    p = p * s + 0.003479549227f;
+    p = p * s - 0.008898663359f;
+    p = p * s + 0.01534600094f;
+    p = p * s - 0.02213626529f;
+    p = p * s + 0.03174594614f;
+    p = p * s - 0.05304612139f;
+    p = p * s + 0.1591548374f;
+    p = p * t;
+    p = p > 0 ? p : 0; /* NaN too */
+    i = (int32_t)((p < 0.125f ? p : 0.125f) * 67108864.0f);
+    i = ay > ax ? 16777216 - i : i;
+    i = dx < 0 ? 33554432 - i : i;
+    i = dy < 0 ? 67108863 - i : i;
+    *x = ((uint32_t)i >> 2) & 0xffffffu;
+    z = z > -1 ? z : -1;
+    z = z < 1 ? z : 1;
+    i = (int32_t)((z + 1) * 8388608.0f);
+    *y = i < 16777215 ? (uint32_t)i : 16777215u;
+}
+
+/* 24-bit coordinates with fractions (in units of 2^-24 of the axis) to a unit direction. Polynomials: minimax fits of
+   sine and cosine on an eighth of a turn, error 2e-9. [any thread] */
+GSD_QUERY void gsd_direction(double x, double y, float direction[3])
+{
+    float z = (float)(y * 1.1920928955078125e-7 - 1.0);
+    double turn = x * 5.9604644775390625e-8; /* 2^-24 */
+    int32_t q = (int32_t)(turn * 4 + 0.5);
+    float f = (float)(turn - 0.25 * q), g = f * f, s, c, r, swap;
+    s = f * (6.28318522f + g * (-41.3416277f + g * (81.5880703f + g * -75.2377448f)));
+    c = 1 + g * (-19.7392087f + g * (64.9393261f + g * (-85.4436999f + g * 59.2443711f)));
+    z = z > -1 ? z : -1;
+    z = z < 1 ? z : 1;
+    r = sqrtf((1 - z) * (1 + z));
+    swap = q & 1 ? c : s; /* quarter turns: (c, s) -> (-s, c) */
+    c = q & 1 ? -s : c;
+    s = swap;
+    r = q & 2 ? -r : r;
+    direction[0] = r * c;
+    direction[1] = r * s;
+    direction[2] = z;
+}
+
+/* Two floats in [0, 1) to two doubles in [0, 1) of 32 bits: 24 bits of each float, then 8 of a hash of both. */
+GSD_QUERY void gsd_extend_random(const float u[2], double out[2])
+{
+    uint32_t a = (uint32_t)((double)u[0] * 16777216.0), b = (uint32_t)((double)u[1] * 16777216.0), h;
+    a = a < 16777215u ? a : 16777215u;
+    b = b < 16777215u ? b : 16777215u;
+    h = (a * 0x9e3779b1u) ^ (b * 0x85ebca6bu + 0x27d4eb2fu);
+    h = (h ^ (h >> 15)) * 0x2c1b3c6du;
+    h ^= h >> 13;
+    out[0] = ((double)a * 256.0 + (double)(h & 255u)) * 2.3283064365386963e-10;
+    out[1] = ((double)b * 256.0 + (double)((h >> 8) & 255u)) * 2.3283064365386963e-10;
+}
+
+/* Leaf of the quadtree at coordinates x, y. */
+GSD_QUERY uint32_t gsd_leaf_at(const gsd_view *view, const gsd_handle *handle, uint32_t x, uint32_t y)
+{
+    uint32_t node = handle->root, shift = 24, child;
+    if (handle->jump) {
+        node = view->jumps[handle->jump + (y >> 21) * 8 + (x >> 21)];
+        shift = 21;
+    }
+    while ((child = view->nodes[node].inner.child) != 0) {
+        --shift;
+        node = child + ((x >> shift) & 1u) + 2 * ((y >> shift) & 1u);
+    }
+    return node;
+}
+
+/* The cell as a handle. cell < view->cell_count; larger ones give the uniform density. For forests. [any thread] */
+GSD_QUERY gsd_handle gsd_find_cell(const gsd_view *view, uint32_t cell)
+{
+    gsd_handle handle = {0, 0, 0, 0, 0, 1.0f};
+    if (cell < view->cell_count) {
+        const gsd_cell *c = &view->cells[cell];
+        handle.cell = cell;
+        handle.root = c->root;
+        handle.jump = c->jump;
+        handle.alias = c->alias;
+        handle.alias_count = c->alias_count;
+        handle.alpha = c->alpha;
+    }
+    return handle;
+}
+
+/* Position along one axis to a 24-bit coordinate; outside and NaN are clamped. */
+GSD_QUERY uint32_t gsd_grid_coordinate(float position, float origin, float scale)
+{
+    float t = (position - origin) * scale;
+    t = t > 0 ? t : 0;
+    return t < 16777215.0f ? (uint32_t)t : 16777215u;
+}
+
+/* Cell at grid coordinates. */
+GSD_QUERY uint32_t gsd_cell_at(const gsd_view *view, const uint32_t g[3])
+{
+    uint32_t link = view->grid[(g[0] >> 20) << 8 | (g[1] >> 20) << 4 | g[2] >> 20], shift = 19;
+    while (!(link & GSD_CELL_BIT)) {
+        link = view->spatial[link + ((g[0] >> shift) & 1u)];
+        if (link & GSD_CELL_BIT)
+            break;
+        link = view->spatial[link + ((g[1] >> shift) & 1u)];
+        if (link & GSD_CELL_BIT)
+            break;
+        link = view->spatial[link + ((g[2] >> shift) & 1u)];
+        --shift;
+    }
+    return link & ~GSD_CELL_BIT;
+}
+
+/* Extent along an axis of a cell at this level of the spatial tree, in grid units. */
+GSD_QUERY uint32_t gsd_cell_extent(uint32_t level, uint32_t axis) { return 16777216u >> ((level + 2 - axis) / 3); }
+
+/* Find the cell of a position. u = three random numbers in [0,1) jitter the position by the size of its cell, which
+   blends neighbours (unbiased: sample and pdf speak of the handle's cell); NULL = the cell it lies in. [any thread] */
+GSD_QUERY gsd_handle gsd_find(const gsd_view *view, const float position[3], const float *u)
+{
+    uint32_t g[3], cell, axis;
+    for (axis = 0; axis < 3; ++axis)
+        g[axis] = gsd_grid_coordinate(position[axis], view->origin[axis], view->scale);
+    cell = gsd_cell_at(view, g);
+    if (u) {
+        uint32_t level = view->cells[cell].level;
+        for (axis = 0; axis < 3; ++axis) {
+            double t = (double)g[axis] + ((double)u[axis] - 0.5) * (double)gsd_cell_extent(level, axis);
+            g[axis] = t <= 0 ? 0 : t < 16777215.0 ? (uint32_t)t : 16777215u;
+        }
+        cell = gsd_cell_at(view, g);
+    }
+    return gsd_find_cell(view, cell);
+}
+
+/* Density (1/sr) with which gsd_sample draws this direction (unit); > 0 everywhere. [any thread] */
+GSD_QUERY float gsd_pdf(const gsd_view *view, const gsd_handle *handle, const float direction[3])
+{
+    uint32_t x, y;
+    gsd_coordinates(direction, &x, &y);
+    return view->nodes[gsd_leaf_at(view, handle, x, y)].leaf.pdf;
+}
+
+/* Direction at (tx, ty) in [0, 1)^2 within a leaf, and the density of the rounded direction: the leaf's, unless the
+   direction is so near to the leaf's edge (2 of 2^24 units) that it may have crossed it. */
+GSD_QUERY float gsd_sample_leaf(const gsd_view *view, const gsd_handle *handle, uint32_t node, double tx, double ty,
+                                float direction[3])
+{
+    const gsd_node *leaf = &view->nodes[node];
+    double size = (double)(16777216u >> (leaf->leaf.x >> 24));
+    double fx, fy;
+    tx = tx > 0 ? tx : 0;
+    ty = ty > 0 ? ty : 0;
+    fx = (tx < 0.99999999988 ? tx : 0.99999999988) * size;
+    fy = (ty < 0.99999999988 ? ty : 0.99999999988) * size;
+    gsd_direction((double)(leaf->leaf.x & 0xffffffu) + fx, (double)leaf->leaf.y + fy, direction);
+    if (fx < 2 || fx > size - 2 || fy < 2 || fy > size - 2)
+        return gsd_pdf(view, handle, direction);
+    return leaf->leaf.pdf;
+}
+
+/* Draw a direction from the two random numbers u in [0, 1); returns its density (1/sr). Monotone in u along phi and z
+   within every quadtree node (keeps stratification), unless the field has alias tables. [any thread] */
+GSD_QUERY float gsd_sample(const gsd_view *view, const gsd_handle *handle, const float u[2], float direction[3])
+{
+    double r[2], lo[2] = {0, 0}, width[2] = {1, 1}, e = (double)view->uniform;
+    uint32_t node = handle->root, child;
+    gsd_extend_random(u, r);
+    if (r[0] < e) { /* uniform share */
+        gsd_direction(r[0] / e * 16777216.0, r[1] * 16777216.0, direction);
+        return gsd_pdf(view, handle, direction);
+    }
+    r[0] = (r[0] - e) / (1 - e);
+    r[0] = r[0] < 0.99999999988 ? r[0] : 0.99999999988;
+    if (handle->alias_count) {
+        double slot = r[0] * (double)handle->alias_count;
+        const gsd_alias *a = &view->aliases[handle->alias + (uint32_t)slot];
+        double rest = slot - floor(slot), t = (double)a->threshold;
+        bool own = rest < t;
+        rest = own ? rest / t : (rest - t) / (1 - t);
+        return gsd_sample_leaf(view, handle, own ? a->node : a->other, rest, r[1], direction);
+    }
+    while ((child = view->nodes[node].inner.child) != 0) { /* narrow [lo, lo + width) around r: no divisions */
+        const float *split = view->nodes[node].inner.split;
+        double w = width[0] * (double)split[0];
+        uint32_t bx = r[0] >= lo[0] + w && w < width[0], by;
+        lo[0] = bx ? lo[0] + w : lo[0];
+        width[0] = bx ? width[0] - w : w;
+        w = width[1] * (double)split[1 + bx];
+        by = r[1] >= lo[1] + w && w < width[1];
+        lo[1] = by ? lo[1] + w : lo[1];
+        width[1] = by ? width[1] - w : w;
+        node = child + bx + 2 * by;
+    }
+    r[0] = (r[0] - lo[0]) / width[0];
+    r[1] = (r[1] - lo[1]) / width[1];
+    return gsd_sample_leaf(view, handle, node, r[0], r[1], direction);
+}
+
+/* A training sample from scalars (channel means). [any thread] */
+GSD_QUERY gsd_training_sample gsd_make_scalar_sample(const float position[3], const float direction[3], float radiance,
+                                                     float contribution, float pixel_contribution, float pdf_mix,
+                                                     float pdf_bsdf, float pdf_guide)
+{
+    gsd_training_sample s;
+    memcpy(s.position, position, sizeof s.position);
+    memcpy(s.direction, direction, sizeof s.direction);
+    s.radiance = radiance;
+    s.contribution = contribution;
+    s.pixel_contribution = pixel_contribution;
+    s.pdf_mix = pdf_mix;
+    s.pdf_bsdf = pdf_bsdf;
+    s.pdf_guide = pdf_guide;
+    return s;
+}
+
+/* A training sample from the renderer's RGB values: L incident radiance, f BSDF without the cosine, pixel_weight
+   throughput before this vertex / pixel estimate (NULL = 1; only the variance-aware target needs it). [any thread] */
+GSD_QUERY gsd_training_sample gsd_make_sample(const float position[3], const float direction[3], const float L[3],
+                                              const float f[3], float cosine, const float pixel_weight[3],
+                                              float pdf_mix, float pdf_bsdf, float pdf_guide)
+{
+    float radiance = 0, contribution = 0, pixel = 0;
+    int c;
+    for (c = 0; c < 3; ++c) {
+        float v = f[c] * L[c] * cosine * (1.0f / 3.0f);
+        radiance += L[c] * (1.0f / 3.0f);
+        contribution += v;
+        pixel += pixel_weight ? v * pixel_weight[c] : v;
+    }
+    return gsd_make_scalar_sample(position, direction, radiance, contribution, pixel, pdf_mix, pdf_bsdf, pdf_guide);
+}
+
+/* ---- >>batch ------------------------------------------------------------------------------------------------ */
+
+/* The queries for arrays: several in flight at once, so that memory latency overlaps. index lists the entries to
+   process in all arrays (NULL = 0 .. count - 1); strides are in bytes. u of find may be NULL, alpha (dense floats) of
+   find may be NULL. Handles are dense. [any thread] */
+GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const float *positions,
+                            size_t position_stride, const float *u, size_t u_stride, gsd_handle *handles,
+                            float *alpha);
+GSD_API void gsd_sample_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const gsd_handle *handles,
+                              const float *u, size_t u_stride, float *directions, size_t direction_stride,
+                              float *pdf);
+GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const gsd_handle *handles,
+                           const float *directions, size_t direction_stride, float *pdf);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif /* GUIDE_SDTREE_H */
+
+/* ============================================== IMPLEMENTATION ============================================== */
+
+#if defined(GSD_IMPLEMENTATION) && !defined(GSD_IMPLEMENTATION_DONE)
+#define GSD_IMPLEMENTATION_DONE
+
+/* Based on the papers listed under REFERENCES; no other code. */
+
+#include <stdlib.h>
+
+#ifndef GSD_ASSERT
+#include <assert.h>
+#define GSD_ASSERT(x) assert(x)
+#endif
+#ifndef GSD_MALLOC
+#define GSD_MALLOC(n) malloc(n)
+#define GSD_FREE(p) free(p)
+#endif
+
+#if !defined(GSD_NO_SIMD) && (defined(__GNUC__) || defined(__clang__)) && defined(__x86_64__)
+#define GSDI_X86 1
+#include <immintrin.h>
+#else
+#define GSDI_X86 0
+#endif
+#if defined(__GNUC__) || defined(__clang__)
+#define GSDI_PREFETCH(p) __builtin_prefetch(p)
+#else
+#define GSDI_PREFETCH(p) ((void)(p))
+#endif
+
+/* What decides structure must not depend on contraction into fused multiply-adds. */
+#if defined(__clang__)
+#pragma STDC FP_CONTRACT OFF
+#elif defined(__GNUC__)
+#pragma GCC push_options
+#pragma GCC optimize("fp-contract=off")
+#endif
+
+#define GSDI_NONE 0xffffffffu
+#define GSDI_GRID 4096u           /* 16^3 links */
+#define GSDI_JUMP_NODES 64u       /* a tree of more nodes than this has a jump table */
+#define GSDI_ROUND (1u << 18)     /* samples sorted at once */
+#define GSDI_SEGMENT 2048u        /* samples prepared at once */
+#define GSDI_STACK 96             /* of a walk through a quadtree: 3 * depth 20 + 4 is the most */
+#define GSDI_GATE_LOW 4           /* values of a below 1 at which V(a) is estimated */
+#define GSDI_MAX_VALUE 9.9e29     /* radiance or weight from here on is a bad sample */
+#define GSDI_MAX_ROOT 1e15        /* values are clamped to this before squaring */
+#define GSDI_CONFIDENCE 1.645     /* one-sided 95 % of the normal distribution */
+#define GSDI_MIN_EFFECTIVE 32.0   /* effective non-zero samples for a verdict "does not pay"; tuned: fewer flips cells
+                                     whose light is rarely found */
+#define GSDI_ENOUGH_HITS 256u      /* non-zero samples of a cell and pass; from then on the gate takes one of eight */
+#define GSDI_MIN_REBUILDS 3         /* before that verdict: the first trees are noise */
+#define GSDI_HISTORY 0.5          /* share of the sums kept where passes do not grow */
+#define GSDI_MAX_CELLS (1u << 26)
+
+/* ---- >>memory ----------------------------------------------------------------------------------------------- */
+
+static void *gsdi_default_allocate(void *user, size_t size)
+{
+    (void)user;
+    return GSD_MALLOC(size);
+}
+
+static void gsdi_default_release(void *user, void *pointer)
+{
+    (void)user;
+    GSD_FREE(pointer);
+}
+
+/* count * size bytes, zeroed; NULL on failure or overflow. */
+static void *gsdi_allocate(const gsd_desc *desc, uint64_t count, size_t size)
+{
+    void *p;
+    if (count > (uint64_t)((size_t)-1 / 2) / size)
+        return NULL;
+    if (count == 0)
+        count = 1;
+    p = desc->allocate(desc->user, (size_t)count * size);
+    if (p)
+        memset(p, 0, (size_t)count * size);
+    return p;
+}
+
+static void gsdi_release(const gsd_desc *desc, void *pointer)
+{
+    if (pointer)
+        desc->release(desc->user, pointer);
+}
+
+static void gsdi_run(gsd_parallel_fn parallel, void *user, uint32_t count, uint32_t grain, gsd_range_fn fn,
+                     void *context)
+{
+    if (parallel && count > grain)
+        parallel(user, count, grain, fn, context);
+    else if (count)
+        fn(context, 0, count);
+}
+
+/* What building knows about a cell; saved as it is, so no padding. Sums are f64. */
+typedef struct gsdi_state {
+    double held;                      /* samples in the sums, those kept from earlier passes included */
+    double fresh;                     /* of this pass */
+    double gate_count;                /* samples that the gate has seen */
+    double v[GSDI_GATE_LOW + 1];      /* sum of x_a = contribution^2 / (p p_a); the last is a = 1 */
+    double vv[GSDI_GATE_LOW + 1];     /* sum of x_a^2 */
+    double cross[GSDI_GATE_LOW];      /* sum of x_a x_1 */
+    float theta, moment1, moment2;    /* Adam: alpha = sigmoid(theta) */
+    uint32_t steps;
+    float alpha;    /* learned; what queries see is in gsd_cell */
+    uint32_t gate;  /* GSD_GATE_... */
+    uint32_t probe; /* closed: passes until the next try; 0 = trying */
+    uint32_t first; /* building nodes first .. first + count - 1, root first */
+    uint32_t count;
+    uint32_t origin[3]; /* lowest corner on the grid */
+    uint32_t level;
+    uint32_t rebuilds; /* times its sampling tree was rebuilt */
+    uint32_t hits;     /* non-zero samples that the gate took in this pass */
+    uint32_t reserved;
+    uint32_t bins[64]; /* held by 4 x 4 x 4 sub-cells, index x y z with 2 bits each, for several splits at once */
+} gsdi_state;
+
+/* A quadtree of the sampling part. */
+typedef struct gsdi_tree {
+    uint32_t root;   /* node; 0 = uniform */
+    uint32_t first;  /* children: groups of 4 nodes from here */
+    uint32_t groups; /* = inner nodes */
+    uint32_t jump, alias, leaves;
+    uint32_t max_depth;
+    float mean_depth;
+} gsdi_tree;
+
+/* Start of a sampling part; offsets in bytes from here. */
+typedef struct gsdi_block {
+    uint64_t size;
+    uint32_t spatial, cells, trees, nodes, jumps, aliases; /* counts */
+    uint64_t grid_at, spatial_at, cells_at, trees_at, nodes_at, jumps_at, aliases_at;
+    float origin[3], scale;
+    float uniform;
+    uint32_t roots; /* nodes before the first group */
+    uint32_t cell_capacity;
+    uint32_t reserved;
+} gsdi_block;
+
+struct gsd_field {
+    gsd_desc desc;
+    void *memory;      /* of block */
+    gsdi_block *block; /* 64-byte aligned within memory */
+    gsdi_state *states;
+    uint32_t *child;   /* building nodes: first child relative to the tree's root, 0 = leaf */
+    double *sum;       /* leaves: sums; inner nodes: scratch of refine */
+    uint32_t building_nodes;
+    uint32_t passes;
+    double first_pass_samples, last_pass_samples;
+    uint32_t first_pass_spp;
+    uint64_t structure;
+    gsd_stats stats;
+    uint32_t guiding; /* cells with alpha < 1 */
+    uint32_t state_capacity, node_capacity;
+    void *scratch; /* of accumulate, kept */
+    uint64_t scratch_size;
+};
+
+/* ---- >>math ------------------------------------------------------------------------------------------------- */
+
+static const double gsdi_gate_alpha[GSDI_GATE_LOW + 1] = {0.1, 0.3, 0.5, 0.75, 1.0};
+
+static bool gsdi_finite(float x) { return x - x == 0; }
+
+static uint64_t gsdi_hash(uint64_t h, uint64_t x)
+{
+    h = (h ^ x) * 0x9fb21c651e98df25ull;
+    return h ^ (h >> 29);
+}
+
+/* Hash of bytes, eight at a time. */
+static uint64_t gsdi_hash_bytes(uint64_t h, const void *data, size_t size)
+{
+    const unsigned char *p = (const unsigned char *)data;
+    uint64_t word;
+    for (; size >= 8; p += 8, size -= 8) {
+        memcpy(&word, p, 8);
+        h = gsdi_hash(h, word);
+    }
+    for (word = 0; size; --size)
+        word = word << 8 | p[size - 1];
+    return gsdi_hash(h, word);
+}
+
+/* Three random numbers in [0, 1) from a sample's own bits, so that they do not depend on how samples were batched. */
+static void gsdi_sample_random(const gsd_training_sample *s, double u[3])
+{
+    uint64_t h = gsdi_hash_bytes(0x2545f4914f6cdd1dull, s, 32);
+    int i;
+    for (i = 0; i < 3; ++i) {
+        h = gsdi_hash(h, 0x9e3779b97f4a7c15ull);
+        u[i] = (double)(h >> 32) * 2.3283064365386963e-10;
+    }
+}
+
+/* ---- >>streams ---------------------------------------------------------------------------------------------- */
+
+typedef struct gsdi_chunk {
+    struct gsdi_chunk *next;
+    uint32_t count, capacity;
+    gsd_training_sample samples[1];
+} gsdi_chunk;
+
+struct gsd_stream {
+    gsd_desc desc;
+    gsdi_chunk *first, *current;
+    uint64_t size, lost, lost_told;
+};
+
+GSD_API gsd_result gsd_stream_create(const gsd_field *field, gsd_stream **stream)
+{
+    *stream = (gsd_stream *)gsdi_allocate(&field->desc, 1, sizeof(gsd_stream));
+    if (!*stream)
+        return GSD_OUT_OF_MEMORY;
+    (*stream)->desc = field->desc;
+    return GSD_OK;
+}
+
+GSD_API void gsd_stream_destroy(gsd_stream *stream)
+{
+    gsdi_chunk *chunk, *next;
+    if (!stream)
+        return;
+    for (chunk = stream->first; chunk; chunk = next) {
+        next = chunk->next;
+        gsdi_release(&stream->desc, chunk);
+    }
+    {
+        gsd_desc desc = stream->desc;
+        gsdi_release(&desc, stream);
+    }
+}
+
+GSD_API void gsd_stream_clear(gsd_stream *stream)
+{
+    gsdi_chunk *chunk;
+    for (chunk = stream->first; chunk; chunk = chunk->next)
+        chunk->count = 0;
+    stream->current = stream->first;
+    stream->size = 0;
+    stream->lost = stream->lost_told = 0;
+}
+
+GSD_API uint64_t gsd_stream_size(const gsd_stream *stream) { return stream->size; }
+
+/* Room for one more sample at least; NULL = out of memory. Chunks: 256 samples, doubling up to 16384. */
+static gsdi_chunk *gsdi_stream_room(gsd_stream *stream)
+{
+    gsdi_chunk *chunk = stream->current, *fresh;
+    uint32_t capacity = 256;
+    if (chunk && chunk->count < chunk->capacity)
+        return chunk;
+    if (chunk && chunk->next)
+        return stream->current = chunk->next; /* from before clear */
+    if (chunk)
+        capacity = chunk->capacity < 16384 ? chunk->capacity * 2 : 16384;
+    fresh = (gsdi_chunk *)stream->desc.allocate(stream->desc.user,
+                                                sizeof(gsdi_chunk) + capacity * sizeof(gsd_training_sample));
+    if (!fresh)
+        return NULL;
+    fresh->next = NULL;
+    fresh->count = 0;
+    fresh->capacity = capacity;
+    if (chunk)
+        chunk->next = fresh;
+    else
+        stream->first = fresh;
+    return stream->current = fresh;
+}
+
+GSD_API gsd_result gsd_record(gsd_stream *stream, const gsd_training_sample *samples, uint32_t count)
+{
+    while (count) {
+        gsdi_chunk *chunk = gsdi_stream_room(stream);
+        uint32_t n;
+        if (!chunk) {
+            stream->lost += count;
+            return GSD_OUT_OF_MEMORY;
+        }
+        n = chunk->capacity - chunk->count;
+        n = n < count ? n : count;
+        memcpy(chunk->samples + chunk->count, samples, n * sizeof *samples);
+        chunk->count += n;
+        stream->size += n;
+        samples += n;
+        count -= n;
+    }
+    return GSD_OK;
+}
+
+GSD_API gsd_result gsd_record_cells(gsd_stream *stream, const uint32_t *cells, const gsd_training_sample *samples,
+                                    uint32_t count)
+{
+    uint32_t i;
+    if (!stream->desc.forest_cells)
+        return GSD_NOT_A_FOREST;
+    for (i = 0; i < count; ++i) {
+        gsd_training_sample s = samples[i];
+        memcpy(s.position, &cells[i], sizeof(uint32_t)); /* a forest's samples carry their cell here */
+        s.position[1] = s.position[2] = 0;
+        if (gsd_record(stream, &s, 1)) {
+            stream->lost += count - i - 1;
+            return GSD_OUT_OF_MEMORY;
+        }
+    }
+    return GSD_OK;
+}
+
+/* ---- >>trees ------------------------------------------------------------------------------------------------ */
+
+/* One node of a walk. */
+typedef struct gsdi_visit {
+    uint32_t node, x, y, depth;
+    uint32_t out; /* node in another tree */
+    double mass, sum;
+} gsdi_visit;
+
+/* Leaf of a building tree at 24-bit coordinates; *depth = its depth. */
+static uint32_t gsdi_building_leaf(const uint32_t *child, uint32_t x, uint32_t y, uint32_t *depth)
+{
+    uint32_t node = 0, shift = 24;
+    while (child[node]) {
+        --shift;
+        node = child[node] + ((x >> shift) & 1u) + 2 * ((y >> shift) & 1u);
+    }
+    *depth = 24 - shift;
+    return node;
+}
+
+/* A square region of a quadtree: node, lowest corner, side. */
+typedef struct gsdi_square {
+    uint32_t node, x, y, size;
+} gsdi_square;
+
+/* Add weight * (overlap area) to every leaf below `root` that overlaps [x0, x1) x [y0, y1), which lies within it. */
+static void gsdi_splat_rectangle(const uint32_t *child, double *sum, gsdi_square root, const uint32_t x[2],
+                                 const uint32_t y[2], double weight)
+{
+    gsdi_square stack[GSDI_STACK];
+    uint32_t top = 0, k;
+    stack[top++] = root;
+    while (top) {
+        gsdi_square b = stack[--top];
+        uint32_t c = child[b.node], half = b.size >> 1;
+        uint32_t xa = x[0] > b.x ? x[0] : b.x, xb = x[1] < b.x + b.size ? x[1] : b.x + b.size;
+        uint32_t ya = y[0] > b.y ? y[0] : b.y, yb = y[1] < b.y + b.size ? y[1] : b.y + b.size;
+        if (xa >= xb || ya >= yb)
+            continue;
+        if (!c) {
+            sum[b.node] += weight * ((double)(xb - xa) * (double)(yb - ya));
+            continue;
+        }
+        for (k = 4; k-- > 0;) {
+            gsdi_square *s = &stack[top++];
+            s->node = c + k;
+            s->x = b.x + (k & 1) * half;
+            s->y = b.y + (k >> 1) * half;
+            s->size = half;
+        }
+    }
+}
+
+/* Box filter [Mueller 2019]: spread value over a box of the size of the leaf at (x, y), centred there. phi wraps; what
+   passes a pole comes back at phi + half a turn. The sum over all leaves grows by value. The box overlaps four squares
+   of its own size; each is a leaf, part of a larger one, or divided further. */
+static void gsdi_splat_box(const uint32_t *child, double *sum, uint32_t x, uint32_t y, double value)
+{
+    uint32_t depth, leaf = gsdi_building_leaf(child, x, y, &depth);
+    int32_t size = 16777216 >> depth, xs[3], ys[3], i, j;
+    double weight = value / ((double)size * (double)size);
+    if (depth == 0) {
+        sum[leaf] += value;
+        return;
+    }
+    xs[0] = (int32_t)x - size / 2;
+    xs[1] = (xs[0] + size - 1) & -size;
+    xs[2] = xs[0] + size;
+    ys[0] = (int32_t)y - size / 2;
+    ys[1] = (ys[0] + size - 1) & -size;
+    ys[2] = ys[0] + size;
+    for (j = 0; j < 2; ++j) {
+        int32_t low = ys[j], height = ys[j + 1] - ys[j], turn = 0;
+        if (low < 0 || low >= 16777216) { /* past a pole */
+            low = low < 0 ? -ys[j + 1] : 33554432 - ys[j + 1];
+            turn = 8388608;
+        }
+        for (i = 0; i < 2; ++i) {
+            uint32_t left = (uint32_t)(xs[i] + turn) & 0xffffffu, bottom = (uint32_t)low, shift = 24, node = 0;
+            int32_t width = xs[i + 1] - xs[i];
+            if (width == 0 || height == 0)
+                continue;
+            while (child[node] && shift > 24 - depth) {
+                --shift;
+                node = child[node] + ((left >> shift) & 1u) + 2 * ((bottom >> shift) & 1u);
+            }
+            if (child[node]) {
+                gsdi_square root = {0, 0, 0, 0};
+                uint32_t rx[2], ry[2];
+                root.node = node;
+                root.size = (uint32_t)size;
+                root.x = left & ~(root.size - 1);
+                root.y = bottom & ~(root.size - 1);
+                rx[0] = left;
+                rx[1] = left + (uint32_t)width;
+                ry[0] = bottom;
+                ry[1] = bottom + (uint32_t)height;
+                gsdi_splat_rectangle(child, sum, root, rx, ry, weight);
+            } else {
+                sum[node] += weight * ((double)width * (double)height);
+            }
+        }
+    }
+}
+
+/* Masses of all nodes of a building tree: leaves' own (or the root of sum * solid-angle fraction for second moments),
+   inner nodes the sum of their children; inner sums likewise. Children come after parents. Returns the total. */
+static double gsdi_tree_masses(const uint32_t *child, double *sum, uint32_t count, bool second_moment, double *mass,
+                               unsigned char *depth)
+{
+    uint32_t i;
+    depth[0] = 0;
+    for (i = 0; i < count; ++i) {
+        uint32_t c = child[i];
+        if (c)
+            depth[c] = depth[c + 1] = depth[c + 2] = depth[c + 3] = (unsigned char)(depth[i] + 1);
+        else
+            mass[i] = second_moment ? sqrt(sum[i]) * (1.0 / (double)(1u << depth[i])) : sum[i];
+    }
+    for (i = count; i-- > 0;) {
+        uint32_t c = child[i];
+        if (c) {
+            mass[i] = (mass[c] + mass[c + 1]) + (mass[c + 2] + mass[c + 3]);
+            sum[i] = (sum[c] + sum[c + 1]) + (sum[c + 2] + sum[c + 3]);
+        }
+    }
+    return mass[0];
+}
+
+/* Structure for the next pass: a node is divided where its mass exceeds limit; new halves get a quarter each. out_child
+   and out_sum (keep times the old sums, pushed down evenly) may be NULL: count only. Returns the number of nodes. */
+static uint32_t gsdi_refine_tree(const uint32_t *child, const double *sum, const double *mass, double limit,
+                                 uint32_t max_depth, double keep, uint32_t *out_child, double *out_sum)
+{
+    gsdi_visit stack[GSDI_STACK];
+    uint32_t total = 1;
+    int top = 0, k;
+    memset(&stack[0], 0, sizeof stack[0]);
+    stack[0].mass = mass[0];
+    stack[0].sum = sum[0];
+    while (top >= 0) {
+        gsdi_visit v = stack[top--];
+        bool divide = v.mass > limit && v.depth < max_depth;
+        if (out_child) {
+            out_child[v.out] = divide ? total : 0;
+            out_sum[v.out] = divide ? 0 : v.sum * keep;
+        }
+        if (!divide)
+            continue;
+        for (k = 3; k >= 0; --k) {
+            gsdi_visit *next = &stack[++top];
+            uint32_t c = v.node == GSDI_NONE ? 0 : child[v.node];
+            next->node = c ? c + (uint32_t)k : GSDI_NONE;
+            next->depth = v.depth + 1;
+            next->out = total + (uint32_t)k;
+            next->mass = c ? mass[next->node] : v.mass * 0.25;
+            next->sum = c ? sum[next->node] : v.sum * 0.25;
+        }
+        total += 4;
+    }
+    return total;
+}
+
+/* ---- >>accumulate ------------------------------------------------------------------------------------------- */
+
+/* What accumulate keeps of a sample while it sorts. 32 bytes. */
+typedef struct gsdi_item {
+    uint32_t x; /* 24-bit coordinate; bits 24 .. 29: index into gsdi_state.bins */
+    uint32_t y; /* 24-bit coordinate; bit 24: rejected before tracing */
+    float value; /* radiance, contribution or pixel contribution, as the target asks */
+    float contribution, pdf_mix, pdf_bsdf, pdf_guide;
+    float weight; /* what goes into the quadtree */
+} gsdi_item;
+
+typedef struct gsdi_segment {
+    const gsd_training_sample *samples;
+    uint32_t count, base;
+    uint32_t refused, clamped, zeros, rejected;
+} gsdi_segment;
+
+typedef struct gsdi_accumulation {
+    gsd_field *field;
+    gsd_view view;
+    gsd_target target; /* of this pass: never switching */
+    bool second_moment, stochastic, box, judge;
+    uint32_t total;
+    gsdi_segment *segments;
+    uint32_t segment_count, segment_capacity;
+    gsdi_item *items;      /* [GSDI_ROUND] */
+    uint32_t *read_cell;   /* [GSDI_ROUND] the cell a sample lies in */
+    uint32_t *target_cell; /* [GSDI_ROUND] the cell it is added to (== read_cell without the stochastic filter) */
+    uint32_t *order;       /* [GSDI_ROUND] items sorted by cell */
+    uint32_t *start;       /* [cells + 1] */
+    uint32_t *busy;        /* [cells] cells with samples */
+} gsdi_accumulation;
+
+/* The target that pass `pass` learns. */
+static gsd_target gsdi_pass_target(const gsd_desc *desc, uint32_t pass)
+{
+    if (desc->target == GSD_TARGET_SWITCHING)
+        return pass < desc->switch_pass ? GSD_TARGET_SIMPLE : GSD_TARGET_VARIANCE;
+    return desc->target;
+}
+
+/* False where a sample is bad: not finite, negative, out of range, no density or no direction. */
+static bool gsdi_sample_valid(const gsd_training_sample *s)
+{
+    float length = s->direction[0] * s->direction[0] + s->direction[1] * s->direction[1] +
+                   s->direction[2] * s->direction[2];
+    return length > 1e-12f && length < 1e12f && s->radiance >= 0 && (double)s->radiance < GSDI_MAX_VALUE &&
+           s->contribution >= 0 && (double)s->contribution < GSDI_MAX_VALUE && s->pixel_contribution >= 0 &&
+           (double)s->pixel_contribution < GSDI_MAX_VALUE && s->pdf_mix > 0 && gsdi_finite(s->pdf_mix) &&
+           s->pdf_bsdf >= 0 && gsdi_finite(s->pdf_bsdf) && s->pdf_guide >= 0 && gsdi_finite(s->pdf_guide) &&
+           (double)s->radiance < GSDI_MAX_VALUE * (double)s->pdf_mix &&
+           gsdi_finite(s->position[0] + s->position[1] + s->position[2]);
+}
+
+/* Cells of a sample: where it lies and where it is added. Sets the item's bin. False: no such cell. */
+static bool gsdi_locate(gsdi_accumulation *a, const gsd_training_sample *s, uint32_t at, gsdi_item *item,
+                        gsdi_segment *segment)
+{
+    const gsd_view *view = &a->view;
+    uint32_t g[3], cell, axis, bin = 0;
+    const gsdi_state *state;
+    bool outside = false;
+    if (a->field->desc.forest_cells) {
+        memcpy(&cell, s->position, sizeof cell);
+        a->read_cell[at] = a->target_cell[at] = cell;
+        return cell < view->cell_count;
+    }
+    for (axis = 0; axis < 3; ++axis) {
+        float p = s->position[axis];
+        outside = outside || p < a->field->desc.bounds_min[axis] || p > a->field->desc.bounds_max[axis];
+        g[axis] = gsd_grid_coordinate(p, view->origin[axis], view->scale);
+    }
+    segment->clamped += outside;
+    cell = gsd_cell_at(view, g);
+    a->read_cell[at] = a->target_cell[at] = cell;
+    state = &a->field->states[cell];
+    for (axis = 0; axis < 3; ++axis) {
+        uint32_t extent = gsd_cell_extent(state->level, axis), inside = g[axis] - state->origin[axis];
+        bin = bin << 2 | (extent >= 4 ? inside / (extent >> 2) : 0);
+    }
+    item->x |= (bin & 63u) << 24;
+    if (a->stochastic) {
+        double u[3];
+        gsdi_sample_random(s, u);
+        for (axis = 0; axis < 3; ++axis) {
+            double t = (double)g[axis] + (u[axis] - 0.5) * (double)gsd_cell_extent(state->level, axis);
+            g[axis] = t <= 0 ? 0 : t < 16777215.0 ? (uint32_t)t : 16777215u;
+        }
+        a->target_cell[at] = gsd_cell_at(view, g);
+    }
+    return true;
+}
+
+/* Check samples, find their cells and leaf coordinates. */
+static void gsdi_prepare(void *context, uint32_t begin, uint32_t end)
+{
+    gsdi_accumulation *a = (gsdi_accumulation *)context;
+    uint32_t k, i;
+    for (k = begin; k < end; ++k) {
+        gsdi_segment *segment = &a->segments[k];
+        for (i = 0; i < segment->count; ++i) {
+            const gsd_training_sample *s = &segment->samples[i];
+            uint32_t at = segment->base + i;
+            gsdi_item *item = &a->items[at];
+            bool rejected = s->radiance == 0 && signbit(s->radiance);
+            float d[3], scale;
+            if (!gsdi_sample_valid(s)) {
+                segment->refused++;
+                a->read_cell[at] = a->target_cell[at] = GSDI_NONE;
+                continue;
+            }
+            scale = s->direction[0] * s->direction[0] + s->direction[1] * s->direction[1] +
+                    s->direction[2] * s->direction[2];
+            scale = fabsf(scale - 1) < 1e-4f ? 1 : 1 / sqrtf(scale);
+            d[0] = s->direction[0] * scale;
+            d[1] = s->direction[1] * scale;
+            d[2] = s->direction[2] * scale;
+            gsd_coordinates(d, &item->x, &item->y);
+            item->y |= rejected ? 1u << 24 : 0;
+            if (!gsdi_locate(a, s, at, item, segment)) {
+                segment->refused++;
+                a->read_cell[at] = a->target_cell[at] = GSDI_NONE;
+                continue;
+            }
+            item->value = a->target == GSD_TARGET_RADIANCE ? s->radiance
+                          : a->target == GSD_TARGET_SIMPLE ? s->contribution
+                                                           : s->pixel_contribution;
+            item->value = rejected ? 0 : item->value;
+            item->contribution = rejected ? 0 : s->contribution;
+            item->pdf_mix = s->pdf_mix;
+            item->pdf_bsdf = s->pdf_bsdf;
+            item->pdf_guide = s->pdf_guide;
+            segment->rejected += rejected;
+            segment->zeros += !(s->radiance > 0) || !(s->contribution > 0);
+        }
+    }
+}
+
+/* One Adam step [Kingma 2015; Mueller 2019] on theta, alpha = sigmoid(theta). Gradient of the KL divergence
+   -(g / p) (p_b - p_g) / p_a, or of the second moment -(g^2 / p) (p_b - p_g) / p_a^2, times alpha (1 - alpha), plus
+   0.01 theta. Step 0.01, beta 0.9, 0.999. */
+static void gsdi_adam(gsdi_state *state, double g, double p, double pb, double pg, bool second_moment)
+{
+    double theta = (double)state->theta, a = 1 / (1 + exp(-theta)), pa = a * pb + (1 - a) * pg;
+    double weight = second_moment ? (g / p) * (g / pa) : g / p, gradient, m, v, t;
+    gradient = -weight * (pb - pg) / pa * a * (1 - a);
+    if (!(fabs(gradient) < 1e30))
+        return;
+    gradient += 0.01 * theta;
+    t = (double)(state->steps < 1000000u ? ++state->steps : state->steps);
+    m = 0.9 * (double)state->moment1 + 0.1 * gradient;
+    v = 0.999 * (double)state->moment2 + 0.001 * gradient * gradient;
+    state->moment1 = (float)(m < 1e30 ? m > -1e30 ? m : -1e30 : 1e30);
+    state->moment2 = (float)(v < 1e38 ? v : 1e38);
+    m /= t < 300 ? 1 - pow(0.9, t) : 1;
+    v /= t < 30000 ? 1 - pow(0.999, t) : 1;
+    theta -= 0.01 * m / (sqrt(v) + 1e-8);
+    state->theta = (float)(theta < -2.94 ? -2.94 : theta > 4 ? 4 : theta); /* alpha >= 0.05 */
+}
+
+/* Sums of the gate: x_a = g^2 / (p p_a) for each a. pb is floored, for a direction that was drawn by the guide but that
+   the BSDF practically never draws. */
+static void gsdi_gate_add(gsdi_state *state, double g, double p, double pb, double pg)
+{
+    double q, x[GSDI_GATE_LOW + 1];
+    int k;
+    g = g < GSDI_MAX_ROOT ? g : GSDI_MAX_ROOT;
+    q = g * (g / p);
+    pb = pb > 1e-4 * p ? pb : 1e-4 * p;
+    for (k = 0; k <= GSDI_GATE_LOW; ++k) {
+        double a = gsdi_gate_alpha[k];
+        x[k] = q / (a * pb + (1 - a) * pg);
+        x[k] = x[k] < 1e60 ? x[k] : 1e60;
+        state->v[k] += x[k];
+        state->vv[k] += x[k] * x[k];
+    }
+    for (k = 0; k < GSDI_GATE_LOW; ++k)
+        state->cross[k] += x[k] * x[GSDI_GATE_LOW];
+}
+
+/* Learn from one item in the cell where it lies; sets the weight that goes into the quadtree. */
+static void gsdi_learn(const gsdi_accumulation *a, gsdi_state *state, const gsd_handle *handle, gsdi_item *item)
+{
+    const gsd_desc *desc = &a->field->desc;
+    uint32_t x = item->x & 0xffffffu, y = item->y & 0xffffffu;
+    double p = (double)item->pdf_mix, pb = (double)item->pdf_bsdf, pg = (double)item->pdf_guide;
+    double c = (double)item->contribution, value = (double)item->value;
+    bool judge = a->judge && handle->root && (state->gate != GSD_GATE_CLOSED || state->probe == 0);
+    bool weigh = a->second_moment && !desc->no_guide_weight && value > 0;
+    state->fresh += 1;
+    state->bins[item->x >> 24] += 1;
+    judge = judge && (state->hits < GSDI_ENOUGH_HITS || ((uint32_t)(int64_t)state->fresh & 7u) == 0);
+    state->gate_count += judge;
+    if (((judge && c > 0) || weigh) && !(pg > 0))
+        pg = (double)a->view.nodes[gsd_leaf_at(&a->view, handle, x, y)].leaf.pdf;
+    if (judge && c > 0) {
+        state->hits++;
+        gsdi_gate_add(state, c, p, pb, pg);
+        if (desc->alpha_mode == GSD_ALPHA_ADAM)
+            gsdi_adam(state, c < GSDI_MAX_ROOT ? c : GSDI_MAX_ROOT, p, pb, pg, a->second_moment);
+    }
+    if (a->second_moment) {
+        value = value < GSDI_MAX_ROOT ? value : GSDI_MAX_ROOT;
+        if (weigh) {
+            double alpha = handle->alpha < 1 ? (double)handle->alpha : 0.5;
+            double mix = alpha * pb + (1 - alpha) * pg;
+            value *= mix > 0 ? (1 - alpha) * pg / mix : 1;
+        }
+        value *= value;
+    }
+    value /= p;
+    item->weight = (float)(value < 1e30 ? value : 1e30);
+}
+
+static void gsdi_splat(const gsdi_accumulation *a, uint32_t cell, const gsdi_item *item)
+{
+    const gsdi_state *state = &a->field->states[cell];
+    const uint32_t *child = a->field->child + state->first;
+    double *sum = a->field->sum + state->first;
+    uint32_t x = item->x & 0xffffffu, y = item->y & 0xffffffu, depth;
+    if (!(item->weight > 0))
+        return;
+    if (a->box)
+        gsdi_splat_box(child, sum, x, y, (double)item->weight);
+    else
+        sum[gsdi_building_leaf(child, x, y, &depth)] += (double)item->weight;
+}
+
+/* Busy cells [begin, end): statistics, and the quadtree sums where both belong to the same cell. */
+static void gsdi_learn_cells(void *context, uint32_t begin, uint32_t end)
+{
+    gsdi_accumulation *a = (gsdi_accumulation *)context;
+    uint32_t b, i;
+    for (b = begin; b < end; ++b) {
+        uint32_t cell = a->busy[b], stop = a->start[cell + 1];
+        gsd_handle handle = gsd_find_cell(&a->view, cell);
+        gsdi_state *state = &a->field->states[cell];
+        for (i = a->start[cell]; i < stop; ++i) {
+            gsdi_item *item = &a->items[a->order[i]];
+            if (i + 8 < stop)
+                GSDI_PREFETCH(&a->items[a->order[i + 8]]);
+            gsdi_learn(a, state, &handle, item);
+            if (!a->stochastic) {
+                state->held += 1;
+                gsdi_splat(a, cell, item);
+            }
+        }
+    }
+}
+
+/* Busy cells [begin, end): quadtree sums with the stochastic filter. */
+static void gsdi_splat_cells(void *context, uint32_t begin, uint32_t end)
+{
+    gsdi_accumulation *a = (gsdi_accumulation *)context;
+    uint32_t b, i;
+    for (b = begin; b < end; ++b) {
+        uint32_t cell = a->busy[b];
+        for (i = a->start[cell]; i < a->start[cell + 1]; ++i)
+            gsdi_splat(a, cell, &a->items[a->order[i]]);
+        a->field->states[cell].held += (double)(a->start[cell + 1] - a->start[cell]);
+    }
+}
+
+/* Stable counting sort of items by cell; fills order, start and busy. Returns the number of busy cells. */
+static uint32_t gsdi_sort(gsdi_accumulation *a, const uint32_t *cell_of)
+{
+    uint32_t cells = a->view.cell_count, i, sum = 0, busy = 0;
+    memset(a->start, 0, ((size_t)cells + 1) * sizeof *a->start);
+    for (i = 0; i < a->total; ++i)
+        if (cell_of[i] != GSDI_NONE)
+            a->start[cell_of[i]]++;
+    for (i = 0; i <= cells; ++i) {
+        uint32_t n = a->start[i];
+        if (n)
+            a->busy[busy++] = i;
+        a->start[i] = sum;
+        sum += n;
+    }
+    for (i = 0; i < a->total; ++i)
+        if (cell_of[i] != GSDI_NONE)
+            a->order[a->start[cell_of[i]]++] = i;
+    memmove(a->start + 1, a->start, cells * sizeof *a->start);
+    a->start[0] = 0;
+    return busy;
+}
+
+/* Process the segments gathered so far. */
+static void gsdi_round(gsdi_accumulation *a, gsd_parallel_fn parallel, void *user)
+{
+    gsd_field *field = a->field;
+    uint32_t i, busy;
+    gsdi_run(parallel, user, a->segment_count, 1, gsdi_prepare, a);
+    busy = gsdi_sort(a, a->read_cell);
+    gsdi_run(parallel, user, busy, 4, gsdi_learn_cells, a);
+    if (a->stochastic) {
+        busy = gsdi_sort(a, a->target_cell);
+        gsdi_run(parallel, user, busy, 4, gsdi_splat_cells, a);
+    }
+    for (i = 0; i < a->segment_count; ++i) {
+        const gsdi_segment *s = &a->segments[i];
+        field->stats.samples += s->count - s->refused;
+        field->stats.refused += s->refused;
+        field->stats.clamped += s->clamped;
+        field->stats.zeros += s->zeros;
+        field->stats.rejected += s->rejected;
+    }
+    a->segment_count = a->total = 0;
+}
+
+static bool gsdi_accumulation_start(gsdi_accumulation *a, gsd_field *field, uint64_t samples)
+{
+    const gsd_desc *desc = &field->desc;
+    uint64_t n = samples < GSDI_ROUND ? samples : GSDI_ROUND, cells = field->block->cells, size;
+    memset(a, 0, sizeof *a);
+    a->field = field;
+    a->view = gsd_get_view(field);
+    a->target = gsdi_pass_target(desc, field->passes);
+    a->second_moment = a->target != GSD_TARGET_RADIANCE;
+    a->stochastic = desc->spatial_filter == GSD_SPATIAL_STOCHASTIC && !desc->forest_cells;
+    a->box = desc->directional_filter == GSD_DIRECTIONAL_BOX;
+    a->judge = !desc->no_gate || desc->alpha_mode != GSD_ALPHA_FIXED;
+    a->segment_capacity = GSDI_ROUND / 64;
+    size = n * (sizeof(gsdi_item) + 3 * 4) + a->segment_capacity * sizeof(gsdi_segment) + (cells * 2 + 3) * 4;
+    if (field->scratch_size < size) {
+        gsdi_release(desc, field->scratch);
+        field->scratch_size = 0;
+        field->scratch = desc->allocate(desc->user, (size_t)size);
+        if (!field->scratch)
+            return false;
+        field->scratch_size = size;
+    }
+    a->items = (gsdi_item *)field->scratch;
+    a->segments = (gsdi_segment *)(void *)(a->items + n);
+    a->read_cell = (uint32_t *)(void *)(a->segments + a->segment_capacity);
+    a->target_cell = a->read_cell + n;
+    a->order = a->target_cell + n;
+    a->start = a->order + n;
+    a->busy = a->start + cells + 2;
+    return true;
+}
+
+GSD_API gsd_result gsd_accumulate(gsd_field *field, gsd_stream *const *streams, uint32_t count,
+                                  gsd_parallel_fn parallel, void *user)
+{
+    gsdi_accumulation a;
+    uint64_t samples = 0;
+    uint32_t k, at, n;
+    const gsdi_chunk *chunk;
+    for (k = 0; k < count; ++k) {
+        samples += streams[k]->size;
+        field->stats.lost += streams[k]->lost - streams[k]->lost_told;
+        streams[k]->lost_told = streams[k]->lost;
+    }
+    if (samples == 0)
+        return GSD_OK;
+    if (!gsdi_accumulation_start(&a, field, samples)) {
+        field->stats.lost += samples;
+        return GSD_OUT_OF_MEMORY;
+    }
+    for (k = 0; k < count; ++k)
+        for (chunk = streams[k]->first; chunk && chunk->count; chunk = chunk->next)
+            for (at = 0; at < chunk->count; at += n) {
+                gsdi_segment *segment;
+                if (a.total == GSDI_ROUND || a.segment_count == a.segment_capacity)
+                    gsdi_round(&a, parallel, user);
+                n = chunk->count - at;
+                n = n < GSDI_SEGMENT ? n : GSDI_SEGMENT;
+                n = n < GSDI_ROUND - a.total ? n : GSDI_ROUND - a.total;
+                segment = &a.segments[a.segment_count++];
+                memset(segment, 0, sizeof *segment);
+                segment->samples = chunk->samples + at;
+                segment->count = n;
+                segment->base = a.total;
+                a.total += n;
+            }
+    gsdi_round(&a, parallel, user);
+    return GSD_OK;
+}
+
+/* ---- >>gate ------------------------------------------------------------------------------------------------- */
+
+/* Mean and standard error of y = x_1 - (1 + margin) x_a, from the sums. Positive: guiding with alpha a pays. */
+static void gsdi_gate_difference(const gsdi_state *s, int a, double margin, double *mean, double *error)
+{
+    double n = s->gate_count, f = 1 + margin, square;
+    *mean = (s->v[GSDI_GATE_LOW] - f * s->v[a]) / n;
+    square = (s->vv[GSDI_GATE_LOW] - 2 * f * s->cross[a] + f * f * s->vv[a]) / n - *mean * *mean;
+    *error = sqrt((square > 0 ? square : 0) / n);
+}
+
+/* Kish's effective number of samples behind V(1). */
+static double gsdi_gate_effective(const gsdi_state *s)
+{
+    double v = s->v[GSDI_GATE_LOW], vv = s->vv[GSDI_GATE_LOW];
+    return vv > 0 ? v * v / vv : 0;
+}
+
+/* alpha from the five V(a), a convex function of a: the minimum of the parabola through the lowest point and its
+   neighbours, pulled towards the present value by 32 effective samples. */
+static float gsdi_grid_alpha(const gsdi_state *s)
+{
+    const double *x = gsdi_gate_alpha, *v = s->v;
+    double best, n = gsdi_gate_effective(s), d0, d1, bend;
+    int k, low = 0;
+    if (!(n > 0))
+        return s->alpha;
+    for (k = 1; k <= GSDI_GATE_LOW; ++k)
+        low = v[k] < v[low] ? k : low;
+    k = low < 1 ? 1 : low > GSDI_GATE_LOW - 1 ? GSDI_GATE_LOW - 1 : low;
+    d0 = (v[k] - v[k - 1]) / (x[k] - x[k - 1]);
+    d1 = (v[k + 1] - v[k]) / (x[k + 1] - x[k]);
+    bend = (d1 - d0) / (x[k + 1] - x[k - 1]);
+    best = bend > 0 ? 0.5 * (x[k - 1] + x[k]) - 0.5 * d0 / bend : x[low];
+    best = best < 0.05 ? 0.05 : best > 0.95 ? 0.95 : best;
+    best = (n * best + 32 * (double)s->alpha) / (n + 32);
+    return (float)best;
+}
+
+/* Verdict on a cell after a pass; fades its sums. See "Gate" in the opening comment. */
+static void gsdi_judge(const gsd_desc *desc, gsdi_state *s, gsd_stats *stats)
+{
+    bool trying = s->gate != GSD_GATE_CLOSED || s->probe == 0;
+    double mean, error, margin = (double)desc->gate_margin;
+    int k, best = 0;
+    if (!trying) {
+        s->probe--;
+        return;
+    }
+    if (desc->alpha_mode == GSD_ALPHA_GRID)
+        s->alpha = gsdi_grid_alpha(s);
+    else if (desc->alpha_mode == GSD_ALPHA_ADAM)
+        s->alpha = 1 / (1 + expf(-s->theta));
+    if (!desc->no_gate && s->gate_count > 0 && gsdi_gate_effective(s) > 0) {
+        stats->probed += s->gate == GSD_GATE_CLOSED;
+        for (k = 1; k < GSDI_GATE_LOW; ++k)
+            best = s->v[k] < s->v[best] ? k : best;
+        gsdi_gate_difference(s, best, s->gate == GSD_GATE_CLOSED ? 2 * margin : margin, &mean, &error);
+        if (mean - GSDI_CONFIDENCE * error > 0 && gsdi_gate_effective(s) >= 4) {
+            stats->opened += s->gate != GSD_GATE_OPEN;
+            s->gate = GSD_GATE_OPEN;
+        } else if (s->gate != GSD_GATE_CLOSED && s->rebuilds >= GSDI_MIN_REBUILDS &&
+                   mean + GSDI_CONFIDENCE * error < 0 && gsdi_gate_effective(s) >= GSDI_MIN_EFFECTIVE) {
+            stats->closed++;
+            s->gate = GSD_GATE_CLOSED;
+        }
+    }
+    if (s->gate == GSD_GATE_CLOSED)
+        s->probe = desc->gate_probe - 1;
+    for (k = 0; k <= GSDI_GATE_LOW; ++k) {
+        s->v[k] *= 0.5;
+        s->vv[k] *= 0.5;
+        if (k < GSDI_GATE_LOW)
+            s->cross[k] *= 0.5;
+    }
+    s->gate_count *= 0.5;
+}
+
+/* ---- >>block ------------------------------------------------------------------------------------------------ */
+
+static const gsdi_tree *gsdi_trees(const gsdi_block *b)
+{
+    return (const gsdi_tree *)(const void *)((const char *)b + b->trees_at);
+}
+
+static gsd_cell *gsdi_cells(gsdi_block *b) { return (gsd_cell *)(void *)((char *)b + b->cells_at); }
+static gsd_node *gsdi_nodes(gsdi_block *b) { return (gsd_node *)(void *)((char *)b + b->nodes_at); }
+static uint32_t *gsdi_words(gsdi_block *b, uint64_t at) { return (uint32_t *)(void *)((char *)b + at); }
+
+/* Offsets and size from the counts. */
+static void gsdi_block_layout(gsdi_block *b)
+{
+    uint64_t at = (sizeof(gsdi_block) + 63) & ~(uint64_t)63;
+    b->nodes_at = at;
+    at += (uint64_t)b->nodes * sizeof(gsd_node);
+    b->jumps_at = at = (at + 63) & ~(uint64_t)63;
+    at += (uint64_t)b->jumps * 4;
+    b->grid_at = at;
+    at += GSDI_GRID * 4;
+    b->trees_at = at;
+    at += (uint64_t)b->trees * sizeof(gsdi_tree);
+    b->spatial_at = at;
+    at += (uint64_t)b->spatial * 4;
+    b->aliases_at = at;
+    at += (uint64_t)b->aliases * sizeof(gsd_alias);
+    b->cells_at = at = (at + 63) & ~(uint64_t)63; /* last, with room to grow */
+    b->cell_capacity = b->cell_capacity > b->cells ? b->cell_capacity : b->cells;
+    b->size = at + (uint64_t)b->cell_capacity * sizeof(gsd_cell);
+}
+
+/* Memory for a block whose counts are set in shape; *memory is what to release. NULL = out of memory. */
+static gsdi_block *gsdi_block_allocate(const gsd_desc *desc, gsdi_block *shape, void **memory)
+{
+    gsdi_block *b;
+    gsdi_block_layout(shape);
+    *memory = gsdi_allocate(desc, shape->size + 64, 1);
+    if (!*memory)
+        return NULL;
+    b = (gsdi_block *)(void *)((char *)*memory + ((64 - ((uintptr_t)*memory & 63)) & 63));
+    *b = *shape;
+    return b;
+}
+
+GSD_API gsd_view gsd_get_view(const gsd_field *field)
+{
+    gsdi_block *b = field->block;
+    gsd_view view;
+    memset(&view, 0, sizeof view);
+    view.grid = gsdi_words(b, b->grid_at);
+    view.spatial = gsdi_words(b, b->spatial_at);
+    view.cells = gsdi_cells(b);
+    view.nodes = gsdi_nodes(b);
+    view.jumps = gsdi_words(b, b->jumps_at);
+    view.aliases = (const gsd_alias *)(const void *)((const char *)b + b->aliases_at);
+    memcpy(view.origin, b->origin, sizeof view.origin);
+    view.scale = b->scale;
+    view.uniform = b->uniform;
+    view.cell_count = b->cells;
+    view.simd = (uint32_t)field->desc.simd;
+    return view;
+}
+
+/* Link of the spatial tree at grid coordinates after at most 12 levels. */
+static uint32_t gsdi_grid_link(const uint32_t *spatial, uint32_t gx, uint32_t gy, uint32_t gz)
+{
+    uint32_t g[3], link = spatial[0], level;
+    g[0] = gx;
+    g[1] = gy;
+    g[2] = gz;
+    for (level = 0; level < 12 && !(link & GSD_CELL_BIT); ++level)
+        link = spatial[link + ((g[level % 3] >> (3 - level / 3)) & 1u)];
+    return link;
+}
+
+static void gsdi_block_grid(gsdi_block *b)
+{
+    uint32_t i, *grid = gsdi_words(b, b->grid_at);
+    const uint32_t *spatial = gsdi_words(b, b->spatial_at);
+    for (i = 0; i < GSDI_GRID; ++i)
+        grid[i] = gsdi_grid_link(spatial, i >> 8, (i >> 4) & 15u, i & 15u);
+}
+
+/* Counts of nodes and tables that a tree needs. */
+static void gsdi_tree_shape(const gsd_desc *desc, gsdi_tree *tree, uint32_t groups)
+{
+    tree->groups = groups;
+    tree->leaves = 3 * groups + 1;
+    tree->jump = groups * 4 + 1 > GSDI_JUMP_NODES;
+    tree->alias = groups && desc->alias ? tree->leaves : 0;
+}
+
+/* Give every tree its place: root, groups, tables; from the shapes that gsdi_tree_shape left in trees. False: more
+   than 32 bits of nodes. */
+static bool gsdi_block_places(gsdi_tree *trees, uint32_t count, gsdi_block *shape)
+{
+    uint64_t nodes = 4, jumps = 0, aliases = 0;
+    uint32_t t;
+    for (t = 0; t < count; ++t)
+        trees[t].root = trees[t].groups ? (uint32_t)nodes++ : 0;
+    nodes = (nodes + 3) & ~(uint64_t)3;
+    shape->roots = (uint32_t)nodes;
+    for (t = 0; t < count; ++t) {
+        trees[t].first = (uint32_t)nodes;
+        nodes += (uint64_t)trees[t].groups * 4;
+        jumps += trees[t].jump ? 64 : 0;
+        trees[t].jump = trees[t].jump ? (uint32_t)jumps : 0; /* offset 0 means none, so tables start at 64 */
+        if (trees[t].alias) {
+            trees[t].alias = (uint32_t)aliases;
+            aliases += trees[t].leaves;
+        }
+        if (nodes > 0xfffffff0u || aliases > 0xfffffff0u)
+            return false;
+    }
+    shape->trees = count;
+    shape->nodes = (uint32_t)nodes;
+    shape->jumps = (uint32_t)jumps + 64;
+    shape->aliases = (uint32_t)aliases;
+    return true;
+}
+
+/* Copies of the uniform leaf in the reserved nodes. */
+static void gsdi_block_uniform(gsdi_block *b)
+{
+    gsd_node *nodes = gsdi_nodes(b);
+    uint32_t i;
+    for (i = 0; i < b->roots; ++i) {
+        nodes[i].leaf.child = 0;
+        nodes[i].leaf.pdf = GSD_INV_4PI;
+        nodes[i].leaf.x = nodes[i].leaf.y = 0;
+    }
+}
+
+static void gsdi_tree_jumps(gsdi_block *b, const gsdi_tree *tree)
+{
+    const gsd_node *nodes = gsdi_nodes(b);
+    uint32_t *jumps = gsdi_words(b, b->jumps_at) + tree->jump, i, k;
+    if (!tree->jump)
+        return;
+    for (i = 0; i < 64; ++i) {
+        uint32_t node = tree->root;
+        for (k = 0; k < 3 && nodes[node].inner.child; ++k)
+            node = nodes[node].inner.child + ((i >> (2 - k)) & 1u) + 2 * ((i >> (5 - k)) & 1u);
+        jumps[i] = node;
+    }
+}
+
+/* Alias table [Walker 1977] over the leaves. The share of leaf l is its learned mass; slots are filled in node order
+   with two stacks that share the `other` fields. */
+static void gsdi_tree_aliases(gsdi_block *b, const gsdi_tree *tree)
+{
+    const gsd_node *nodes = gsdi_nodes(b);
+    gsd_alias *slots = (gsd_alias *)(void *)((char *)b + b->aliases_at) + tree->alias;
+    double e = (double)b->uniform;
+    uint32_t n = 0, i, small = GSDI_NONE, large = GSDI_NONE;
+    for (i = tree->first; i < tree->first + tree->groups * 4; ++i) {
+        const gsd_node *node = &nodes[i];
+        double area = 12.566370614359172 / pow(4, (double)(node->leaf.x >> 24)), mass;
+        if (node->leaf.child)
+            continue;
+        mass = ((double)node->leaf.pdf - e * (double)GSD_INV_4PI) / (1 - e) * area * (double)tree->leaves;
+        slots[n].node = i;
+        slots[n].threshold = (float)(mass > 0 ? mass : 0);
+        if (slots[n].threshold < 1) {
+            slots[n].other = small;
+            small = n++;
+        } else {
+            slots[n].other = large;
+            large = n++;
+        }
+    }
+    while (small != GSDI_NONE && large != GSDI_NONE) {
+        uint32_t s = small, l = large;
+        small = slots[s].other;
+        slots[s].other = slots[l].node;
+        slots[l].threshold -= 1 - slots[s].threshold;
+        if (slots[l].threshold < 1) {
+            large = slots[l].other;
+            slots[l].other = small;
+            small = l;
+        }
+    }
+    for (i = 0; i < 2; ++i) /* what rounding left over */
+        for (n = i ? small : large; n != GSDI_NONE;) {
+            uint32_t next = slots[n].other;
+            slots[n].threshold = 1;
+            slots[n].other = slots[n].node;
+            n = next;
+        }
+}
+
+/* Write a sampling tree from plain masses. child: relative, as in the building part. */
+static void gsdi_tree_write(gsdi_block *b, gsdi_tree *tree, const uint32_t *child, const double *mass)
+{
+    struct gsdi_open {
+        uint32_t node, out, x, y, depth;
+        double pdf; /* learned, of the node as if it were a leaf */
+    } stack[GSDI_STACK];
+    gsd_node *nodes = gsdi_nodes(b);
+    uint32_t next = tree->first, k;
+    double e = (double)b->uniform, mean = 0;
+    int top = 0;
+    memset(&stack[0], 0, sizeof stack[0]);
+    stack[0].out = tree->root;
+    stack[0].pdf = 0.07957747154594766788;
+    tree->max_depth = 0;
+    while (tree->groups && top >= 0) {
+        struct gsdi_open o = stack[top--];
+        gsd_node *out = &nodes[o.out];
+        uint32_t c = child[o.node];
+        const double *m = mass + c;
+        double total, left, right;
+        if (!c) {
+            out->leaf.child = 0;
+            out->leaf.pdf = (float)((1 - e) * o.pdf + e * 0.07957747154594766788);
+            out->leaf.x = o.x | o.depth << 24;
+            out->leaf.y = o.y;
+            tree->max_depth = o.depth > tree->max_depth ? o.depth : tree->max_depth;
+            mean += (double)o.depth * o.pdf * 12.566370614359172 / pow(4, (double)o.depth);
+            continue;
+        }
+        total = (m[0] + m[1]) + (m[2] + m[3]);
+        left = m[0] + m[2];
+        right = m[1] + m[3];
+        out->inner.child = next;
+        out->inner.split[0] = (float)(total > 0 ? left / total : 0.5);
+        out->inner.split[1] = (float)(left > 0 ? m[0] / left : 0.5);
+        out->inner.split[2] = (float)(right > 0 ? m[1] / right : 0.5);
+        for (k = 4; k-- > 0;) { /* densities follow from the rounded shares: what is drawn is what pdf says */
+            struct gsdi_open *s = &stack[++top];
+            double sx = (double)out->inner.split[0], sy = (double)out->inner.split[1 + (k & 1)];
+            double share = (k & 1 ? 1 - sx : sx) * (k & 2 ? 1 - sy : sy);
+            s->node = c + k;
+            s->out = next + k;
+            s->depth = o.depth + 1;
+            s->x = o.x + (k & 1) * (16777216u >> s->depth);
+            s->y = o.y + (k >> 1) * (16777216u >> s->depth);
+            s->pdf = o.pdf * share * 4;
+        }
+        next += 4;
+    }
+    tree->mean_depth = (float)mean;
+    gsdi_tree_jumps(b, tree);
+    if (b->aliases)
+        gsdi_tree_aliases(b, tree);
+}
+
+/* Copy a tree from another block to its new place. */
+static void gsdi_tree_copy(gsdi_block *b, gsdi_tree *tree, gsdi_block *from, const gsdi_tree *old)
+{
+    gsd_node *nodes = gsdi_nodes(b);
+    const gsd_node *source = gsdi_nodes(from);
+    uint32_t i;
+    if (!tree->groups)
+        return;
+    nodes[tree->root] = source[old->root];
+    memcpy(nodes + tree->first, source + old->first, (size_t)tree->groups * 4 * sizeof(gsd_node));
+    nodes[tree->root].inner.child += tree->first - old->first;
+    for (i = tree->first; i < tree->first + tree->groups * 4; ++i)
+        if (nodes[i].inner.child)
+            nodes[i].inner.child += tree->first - old->first;
+    tree->max_depth = old->max_depth;
+    tree->mean_depth = old->mean_depth;
+    gsdi_tree_jumps(b, tree);
+    if (b->aliases)
+        gsdi_tree_aliases(b, tree);
+}
+
+/* ---- >>refine ----------------------------------------------------------------------------------------------- */
+
+/* What refine decides about an old cell. */
+typedef struct gsdi_job {
+    double limit_mass; /* total mass of its building tree */
+    uint32_t rebuild;  /* 1: new sampling tree from the building tree */
+    uint32_t groups;   /* of that tree */
+    uint32_t nodes;    /* of the next building tree */
+    uint32_t tree;     /* index of its sampling tree in the new block */
+    uint32_t copy;     /* 1: this job copies that tree from the old block */
+} gsdi_job;
+
+/* A cell of the new part. */
+typedef struct gsdi_place {
+    uint32_t source; /* old cell */
+    uint32_t first, count;
+    uint32_t origin[3], level;
+    uint32_t samples; /* of the source's bins that fall in here */
+} gsdi_place;
+
+typedef struct gsdi_refinement {
+    gsd_field *field;
+    const gsd_desc *desc;
+    bool second_moment, clear;
+    double rho, keep, split;
+    gsdi_job *jobs;       /* [old cells] */
+    double *mass;         /* [building nodes] */
+    unsigned char *depth; /* [building nodes] */
+    gsdi_place *places;   /* [cells] */
+    uint32_t cells, cell_limit, place_capacity;
+    uint32_t *spatial; /* [spatial_count] */
+    uint32_t spatial_count, spatial_capacity;
+    gsdi_tree *trees;
+    uint32_t tree_count;
+    uint32_t *old_tree; /* [old trees]: index in the new block + 1 */
+    void *memory;
+    gsdi_block *block;
+    gsdi_state *states;
+    uint32_t *child;
+    double *sum;
+    gsd_stats stats;
+} gsdi_refinement;
+
+static void gsdi_refinement_free(gsdi_refinement *r)
+{
+    gsdi_release(r->desc, r->jobs);
+    gsdi_release(r->desc, r->mass);
+    gsdi_release(r->desc, r->depth);
+    gsdi_release(r->desc, r->places);
+    gsdi_release(r->desc, r->spatial);
+    gsdi_release(r->desc, r->trees);
+    gsdi_release(r->desc, r->old_tree);
+    gsdi_release(r->desc, r->memory);
+    gsdi_release(r->desc, r->states);
+    gsdi_release(r->desc, r->child);
+    gsdi_release(r->desc, r->sum);
+}
+
+static uint64_t gsdi_bytes(const gsdi_block *b, uint64_t building_nodes)
+{
+    return b->size + 64 + building_nodes * (sizeof(uint32_t) + sizeof(double)) + b->cells * sizeof(gsdi_state) +
+           sizeof(gsd_field);
+}
+
+/* Masses of the old cells' building trees; whether to rebuild. */
+static void gsdi_measure(void *context, uint32_t begin, uint32_t end)
+{
+    gsdi_refinement *r = (gsdi_refinement *)context;
+    uint32_t c;
+    for (c = begin; c < end; ++c) {
+        const gsdi_state *s = &r->field->states[c];
+        gsdi_job *job = &r->jobs[c];
+        job->nodes = s->count;
+        if (s->fresh <= 0)
+            continue;
+        job->limit_mass = gsdi_tree_masses(r->field->child + s->first, r->field->sum + s->first, s->count,
+                                           r->second_moment, r->mass + s->first, r->depth + s->first);
+        job->rebuild = s->held >= (double)r->desc->min_samples && job->limit_mass > 1e-280;
+        job->groups = (s->count - 1) / 4;
+    }
+}
+
+/* Sizes of the next building trees at the present rho. */
+static void gsdi_count_nodes(void *context, uint32_t begin, uint32_t end)
+{
+    gsdi_refinement *r = (gsdi_refinement *)context;
+    uint32_t c;
+    for (c = begin; c < end; ++c) {
+        const gsdi_state *s = &r->field->states[c];
+        gsdi_job *job = &r->jobs[c];
+        if (job->rebuild)
+            job->nodes = gsdi_refine_tree(r->field->child + s->first, r->field->sum + s->first, r->mass + s->first,
+                                          r->rho * job->limit_mass, r->desc->max_depth, 0, NULL, NULL);
+    }
+}
+
+/* Samples in bins of a sub-cell of `levels` (<= 6) splits below a cell at `level`: bits of path, oldest first. */
+static uint32_t gsdi_bin_samples(const uint32_t *bins, uint32_t level, uint32_t levels, uint32_t path)
+{
+    uint32_t mask = 0, want = 0, i, k, sum = 0;
+    for (k = 0; k < levels; ++k) { /* bin index: x1 x0 y1 y0 z1 z0, high halves first */
+        uint32_t axis = (level + k) % 3, bit = 1u << (5 - 2 * axis - k / 3);
+        mask |= bit;
+        want |= (path >> (levels - 1 - k)) & 1u ? bit : 0;
+    }
+    for (i = 0; i < 64; ++i)
+        sum += (i & mask) == want ? bins[i] : 0;
+    return sum;
+}
+
+/* Split one old cell as often as its bins ask for. The first part keeps the cell's number, others are appended. */
+static void gsdi_split_cell(gsdi_refinement *r, uint32_t cell, uint32_t node)
+{
+    struct gsdi_part {
+        uint32_t place, node, levels, path;
+    } stack[16];
+    const gsdi_state *s = &r->field->states[cell];
+    int top = 0;
+    stack[0].place = cell;
+    stack[0].node = node;
+    stack[0].levels = stack[0].path = 0;
+    while (top >= 0) {
+        struct gsdi_part p = stack[top--];
+        gsdi_place *a = &r->places[p.place], *b;
+        uint32_t axis = a->level % 3, k;
+        if (!r->jobs[cell].rebuild || p.levels == 6 || (double)a->samples <= r->split ||
+            a->level >= r->desc->max_levels || r->cells >= r->cell_limit || r->cells >= r->place_capacity)
+            continue;
+        r->stats.split_cells++;
+        b = &r->places[r->cells];
+        *b = *a;
+        a->level = b->level = a->level + 1;
+        b->origin[axis] += gsd_cell_extent(b->level, axis);
+        p.path <<= 1;
+        p.levels++;
+        a->samples = gsdi_bin_samples(s->bins, s->level, p.levels, p.path);
+        b->samples = gsdi_bin_samples(s->bins, s->level, p.levels, p.path | 1u);
+        r->spatial[p.node] = r->spatial_count;
+        for (k = 0; k < 2; ++k) {
+            struct gsdi_part *next = &stack[++top];
+            next->place = k ? r->cells : p.place;
+            next->node = r->spatial_count + k;
+            next->levels = p.levels;
+            next->path = p.path | k;
+            r->spatial[next->node] = GSD_CELL_BIT | next->place;
+        }
+        r->spatial_count += 2;
+        r->cells++;
+    }
+}
+
+/* How many parts splitting a cell can give at most: counts bins instead of building anything. */
+static uint32_t gsdi_split_bound(const gsdi_refinement *r, const gsdi_state *s)
+{
+    double parts = r->split > 0 ? s->held / r->split : 0;
+    parts = 6 * parts + 1; /* every split part holds more than `split`; at most 6 levels of them */
+    return parts > 64 ? 64 : (uint32_t)parts;
+}
+
+/* The new cells. False = out of memory. */
+static bool gsdi_split_cells(gsdi_refinement *r)
+{
+    gsd_field *field = r->field;
+    uint32_t old = field->block->cells, i, nodes = field->block->spatial;
+    uint64_t capacity = 0;
+    for (i = 0; i < old; ++i)
+        capacity += r->jobs[i].rebuild && !r->desc->forest_cells ? gsdi_split_bound(r, &field->states[i]) : 1;
+    if (capacity > (uint64_t)r->cell_limit)
+        capacity = r->cell_limit > old ? r->cell_limit : old;
+    r->place_capacity = (uint32_t)capacity;
+    r->spatial_capacity = nodes + 2 * (r->place_capacity - old);
+    r->places = (gsdi_place *)gsdi_allocate(r->desc, r->place_capacity, sizeof *r->places);
+    r->spatial = (uint32_t *)gsdi_allocate(r->desc, r->spatial_capacity, sizeof(uint32_t));
+    if (!r->places || !r->spatial)
+        return false;
+    memcpy(r->spatial, gsdi_words(field->block, field->block->spatial_at), nodes * sizeof(uint32_t));
+    r->spatial_count = nodes;
+    r->cells = old;
+    for (i = 0; i < old; ++i) {
+        gsdi_place *p = &r->places[i];
+        p->source = i;
+        memcpy(p->origin, field->states[i].origin, sizeof p->origin);
+        p->level = field->states[i].level;
+        p->samples = gsdi_bin_samples(field->states[i].bins, 0, 0, 0);
+    }
+    if (!r->desc->forest_cells)
+        for (i = 0; i < nodes; ++i)
+            if (r->spatial[i] & GSD_CELL_BIT)
+                gsdi_split_cell(r, r->spatial[i] & ~GSD_CELL_BIT, i);
+    return true;
+}
+
+/* Nodes and cells that fit under max_bytes, when the old and the new part, and scratch, exist together. */
+static uint64_t gsdi_node_limit(const gsdi_refinement *r, uint32_t cells)
+{
+    uint64_t per_cell = 2 * (sizeof(gsdi_state) + sizeof(gsd_cell) + sizeof(gsdi_tree)) + sizeof(gsdi_job) +
+                        sizeof(gsdi_place) + sizeof(gsdi_tree) + 6 * sizeof(uint32_t) + 64;
+    uint64_t per_node = 2 * (16 + 4 + (r->desc->alias ? 9 : 0)) + 2 * 12 + 9;
+    uint64_t fixed = 2 * (GSDI_GRID * 4 + 1024) + sizeof(gsd_field) + cells * per_cell;
+    return fixed < r->desc->max_bytes ? (r->desc->max_bytes - fixed) / per_node : 0;
+}
+
+static uint32_t gsdi_cell_limit(const gsd_desc *desc)
+{
+    uint64_t limit = desc->max_bytes / 4 / (2 * sizeof(gsdi_state) + 512);
+    return limit < GSDI_MAX_CELLS ? (uint32_t)limit : GSDI_MAX_CELLS;
+}
+
+/* Where every new building tree goes; returns the total of nodes. */
+static uint64_t gsdi_place_nodes(gsdi_refinement *r)
+{
+    uint64_t total = 0;
+    uint32_t i;
+    for (i = 0; i < r->cells; ++i) {
+        gsdi_place *p = &r->places[i];
+        const gsdi_job *job = &r->jobs[p->source];
+        bool split = p->level != r->field->states[p->source].level;
+        p->count = split && p->samples == 0 ? 1 : job->nodes; /* nothing seen there: start small */
+        p->first = (uint32_t)total;
+        total += p->count;
+    }
+    return total;
+}
+
+/* List the sampling trees of the new block: rebuilt ones, and old ones that some cell keeps. */
+static bool gsdi_list_trees(gsdi_refinement *r, gsdi_block *shape)
+{
+    gsdi_block *old = r->field->block;
+    const gsdi_tree *old_trees = gsdi_trees(old);
+    const gsd_cell *old_cells = gsdi_cells(old);
+    uint32_t c;
+    r->trees = (gsdi_tree *)gsdi_allocate(r->desc, (uint64_t)old->cells + 1, sizeof(gsdi_tree));
+    r->old_tree = (uint32_t *)gsdi_allocate(r->desc, old->trees, sizeof(uint32_t));
+    if (!r->trees || !r->old_tree)
+        return false;
+    gsdi_tree_shape(r->desc, &r->trees[r->tree_count++], 0); /* tree 0: uniform */
+    r->old_tree[0] = 1;
+    for (c = 0; c < old->cells; ++c) {
+        gsdi_job *job = &r->jobs[c];
+        uint32_t t = old_cells[c].tree;
+        if (!job->rebuild && r->old_tree[t]) {
+            job->tree = r->old_tree[t] - 1;
+            continue;
+        }
+        job->tree = r->tree_count++;
+        gsdi_tree_shape(r->desc, &r->trees[job->tree], job->rebuild ? job->groups : old_trees[t].groups);
+        job->copy = !job->rebuild;
+        if (job->copy)
+            r->old_tree[t] = r->tree_count;
+    }
+    return gsdi_block_places(r->trees, r->tree_count, shape);
+}
+
+/* Sampling trees of old cells [begin, end). */
+static void gsdi_write_trees(void *context, uint32_t begin, uint32_t end)
+{
+    gsdi_refinement *r = (gsdi_refinement *)context;
+    gsdi_block *old = r->field->block;
+    uint32_t c;
+    for (c = begin; c < end; ++c) {
+        const gsdi_state *s = &r->field->states[c];
+        const gsdi_job *job = &r->jobs[c];
+        uint32_t t = gsdi_cells(old)[c].tree;
+        if (job->rebuild)
+            gsdi_tree_write(r->block, &r->trees[job->tree], r->field->child + s->first, r->mass + s->first);
+        else if (job->copy)
+            gsdi_tree_copy(r->block, &r->trees[job->tree], old, &gsdi_trees(old)[t]);
+    }
+}
+
+/* What a cell of the block says to queries. */
+static void gsdi_cell_write(gsdi_block *b, const gsdi_tree *trees, gsd_cell *cell, const gsdi_state *s, uint32_t tree)
+{
+    const gsdi_tree *t = &trees[tree];
+    cell->root = t->root;
+    cell->jump = t->jump;
+    cell->alias = t->alias;
+    cell->alias_count = b->aliases && t->groups ? t->leaves : 0;
+    cell->tree = tree;
+    cell->level = s->level;
+    cell->gate = s->gate;
+    cell->alpha = t->groups == 0 || s->gate == GSD_GATE_CLOSED ? 1.0f : s->alpha;
+}
+
+/* State, building tree and query record of new cells [begin, end). */
+static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
+{
+    gsdi_refinement *r = (gsdi_refinement *)context;
+    uint32_t i, k;
+    for (i = begin; i < end; ++i) {
+        const gsdi_place *p = &r->places[i];
+        const gsdi_state *old = &r->field->states[p->source];
+        const gsdi_job *job = &r->jobs[p->source];
+        const uint32_t *child = r->field->child + old->first;
+        const double *sum = r->field->sum + old->first;
+        gsdi_state *s = &r->states[i];
+        double total = 0, share, keep = 0;
+        *s = *old;
+        s->first = p->first;
+        s->count = p->count;
+        s->level = p->level;
+        memcpy(s->origin, p->origin, sizeof s->origin);
+        if (!job->rebuild) {
+            memcpy(r->child + p->first, child, p->count * sizeof *child);
+            for (k = 0; k < p->count; ++k)
+                r->sum[p->first + k] = child[k] ? 0 : sum[k];
+        } else {
+            for (k = 0; k < 64; ++k)
+                total += (double)old->bins[k];
+            share = total > 0 ? (double)p->samples / total : 1;
+            share = p->level == old->level ? 1 : share;
+            keep = r->keep * share;
+            if (p->count > 1 || job->nodes == 1)
+                gsdi_refine_tree(child, sum, r->mass + old->first, r->rho * job->limit_mass, r->desc->max_depth, keep,
+                                 r->child + p->first, r->sum + p->first);
+            s->held = old->held * keep;
+            s->rebuilds = old->rebuilds < 1000000u ? old->rebuilds + 1 : old->rebuilds;
+            for (k = 0; k < 64; ++k)
+                s->bins[k] = p->level == old->level ? (uint32_t)((double)old->bins[k] * r->keep) : 0;
+            share = share < 0.01 ? 0.01 : share;
+            for (k = 0; k <= GSDI_GATE_LOW; ++k) {
+                s->v[k] *= share;
+                s->vv[k] *= share;
+                if (k < GSDI_GATE_LOW)
+                    s->cross[k] *= share;
+            }
+            s->gate_count *= share;
+        }
+        if (r->clear) { /* another target: what waits is of no use */
+            s->held = 0;
+            memset(s->bins, 0, sizeof s->bins);
+            for (k = 0; k < p->count; ++k)
+                r->sum[p->first + k] = 0;
+        }
+        s->fresh = 0;
+        s->hits = 0;
+        gsdi_cell_write(r->block, r->trees, &gsdi_cells(r->block)[i], s, job->tree);
+    }
+}
+
+/* Threshold of splitting c sqrt(2^k), 2^k = growth of the pass over the first; share of sums to keep. */
+static void gsdi_pass_scale(gsdi_refinement *r, const gsd_pass *pass, double samples)
+{
+    gsd_field *field = r->field;
+    double growth = 1;
+    if (pass && pass->spp && field->first_pass_spp)
+        growth = (double)pass->spp / (double)field->first_pass_spp;
+    else if (field->first_pass_samples > 0)
+        growth = samples / field->first_pass_samples;
+    r->split = (double)r->desc->split_samples * sqrt(growth > 1 ? growth : 1);
+    r->keep = !r->desc->no_history && field->last_pass_samples > 0 && samples < 1.5 * field->last_pass_samples
+                  ? GSDI_HISTORY
+                  : 0;
+    r->clear = gsdi_pass_target(r->desc, field->passes) != gsdi_pass_target(r->desc, field->passes + 1);
+    if (r->clear)
+        r->keep = 0;
+}
+
+/* Everything that refine allocates after the structure is known. */
+static bool gsdi_refine_allocate(gsdi_refinement *r, uint32_t building_nodes)
+{
+    gsdi_block shape = *r->field->block;
+    if (!gsdi_list_trees(r, &shape))
+        return false;
+    shape.cells = shape.cell_capacity = r->cells;
+    shape.spatial = r->spatial_count;
+    r->block = gsdi_block_allocate(r->desc, &shape, &r->memory);
+    r->states = (gsdi_state *)gsdi_allocate(r->desc, r->cells, sizeof(gsdi_state));
+    r->child = (uint32_t *)gsdi_allocate(r->desc, building_nodes, sizeof(uint32_t));
+    r->sum = (double *)gsdi_allocate(r->desc, building_nodes, sizeof(double));
+    return r->block && r->states && r->child && r->sum;
+}
+
+/* Structure decisions of refine: judged cells, splits, rho under the memory cap. Returns building nodes, 0 = out of
+   memory. */
+static uint32_t gsdi_refine_plan(gsdi_refinement *r, gsd_parallel_fn parallel, void *user)
+{
+    gsd_field *field = r->field;
+    uint32_t old = field->block->cells, i;
+    uint64_t total;
+    int tries;
+    r->jobs = (gsdi_job *)gsdi_allocate(r->desc, old, sizeof *r->jobs);
+    r->mass = (double *)gsdi_allocate(r->desc, field->building_nodes, sizeof(double));
+    r->depth = (unsigned char *)gsdi_allocate(r->desc, field->building_nodes, 1);
+    if (!r->jobs || !r->mass || !r->depth)
+        return 0;
+    gsdi_run(parallel, user, old, 16, gsdi_measure, r);
+    for (i = 0; i < old; ++i) {
+        const gsdi_state *s = &field->states[i];
+        r->stats.rebuilt_trees += r->jobs[i].rebuild;
+        r->stats.waiting_cells += !r->jobs[i].rebuild && s->fresh > 0;
+        r->stats.unread_cells += !(s->fresh > 0);
+    }
+    r->cell_limit = gsdi_cell_limit(r->desc);
+    if (!gsdi_split_cells(r))
+        return 0;
+    r->rho = (double)r->desc->rho;
+    for (tries = 0; tries < 64; ++tries) {
+        gsdi_run(parallel, user, old, 16, gsdi_count_nodes, r);
+        total = gsdi_place_nodes(r);
+        if (total <= gsdi_node_limit(r, r->cells) && total < 0xfffffff0u)
+            break;
+        r->rho *= r->rho < 0.9 ? 1.3 : 2;
+    }
+    r->stats.effective_rho = (float)r->rho;
+    return total < 0xfffffff0u ? (uint32_t)total : 0;
+}
+
+/* Hash of cells and building trees. */
+static uint64_t gsdi_structure_hash(const gsdi_state *states, uint32_t cells, const uint32_t *child, uint32_t nodes)
+{
+    uint64_t h = 0x243f6a8885a308d3ull;
+    uint32_t i;
+    for (i = 0; i < cells; ++i) {
+        const gsdi_state *s = &states[i];
+        h = gsdi_hash(h, (uint64_t)s->first << 32 | s->count);
+        h = gsdi_hash(h, (uint64_t)s->origin[0] << 32 | s->origin[1]);
+        h = gsdi_hash(h, (uint64_t)s->origin[2] << 32 | s->level);
+    }
+    return gsdi_hash_bytes(h, child, (size_t)nodes * sizeof *child);
+}
+
+/* After a change of structure: its id, and how many cells guide. */
+static void gsdi_field_changed(gsd_field *field)
+{
+    const gsd_cell *cells = gsdi_cells(field->block);
+    uint32_t i;
+    field->guiding = 0;
+    for (i = 0; i < field->block->cells; ++i)
+        field->guiding += cells[i].alpha < 1;
+    field->structure = gsdi_structure_hash(field->states, field->block->cells, field->child, field->building_nodes);
+}
+
+/* The gate's verdicts, and how the pass's samples are spread over them. */
+static void gsdi_judge_cells(gsdi_refinement *r, double samples)
+{
+    double closed = 0, alpha = 0;
+    uint32_t i;
+    for (i = 0; i < r->field->block->cells; ++i) {
+        gsdi_state *s = &r->field->states[i];
+        if (s->fresh > 0)
+            gsdi_judge(r->desc, s, &r->stats);
+        closed += s->gate == GSD_GATE_CLOSED ? s->fresh : 0;
+        alpha += s->gate == GSD_GATE_CLOSED ? s->fresh : s->fresh * (double)s->alpha;
+    }
+    r->stats.closed_share = samples > 0 ? (float)(closed / samples) : 0;
+    r->stats.mean_alpha = samples > 0 ? (float)(alpha / samples) : 1;
+}
+
+/* Make the new parts the field's, free the old. */
+static void gsdi_refine_commit(gsdi_refinement *r, const gsd_pass *pass, uint32_t nodes, double samples)
+{
+    gsd_field *field = r->field;
+    gsdi_block *old = field->block;
+    uint64_t peak = gsdi_bytes(old, field->building_nodes) + gsdi_bytes(r->block, nodes) +
+                    old->cells * sizeof(gsdi_job) + field->building_nodes * (sizeof(double) + 1) +
+                    r->place_capacity * sizeof(gsdi_place) + r->spatial_capacity * 4 +
+                    ((uint64_t)old->cells + 1) * sizeof(gsdi_tree) + old->trees * 4;
+    r->stats.peak_bytes = peak > r->stats.peak_bytes ? peak : r->stats.peak_bytes;
+    r->stats.passes++;
+    gsdi_release(r->desc, field->memory);
+    gsdi_release(r->desc, field->states);
+    gsdi_release(r->desc, field->child);
+    gsdi_release(r->desc, field->sum);
+    field->memory = r->memory;
+    field->block = r->block;
+    field->states = r->states;
+    field->child = r->child;
+    field->sum = r->sum;
+    field->building_nodes = field->node_capacity = nodes;
+    field->state_capacity = r->cells;
+    if (field->passes == 0) {
+        field->first_pass_samples = samples;
+        field->first_pass_spp = pass ? pass->spp : 0;
+    }
+    field->last_pass_samples = samples;
+    field->passes++;
+    field->stats = r->stats;
+    gsdi_field_changed(field);
+    r->memory = NULL;
+    r->states = NULL;
+    r->child = NULL;
+    r->sum = NULL;
+    gsdi_refinement_free(r);
+}
+
+GSD_API gsd_result gsd_refine(gsd_field *field, const gsd_pass *pass, gsd_parallel_fn parallel, void *user)
+{
+    gsdi_refinement r;
+    uint32_t nodes, i;
+    double samples = 0;
+    memset(&r, 0, sizeof r);
+    r.field = field;
+    r.desc = &field->desc;
+    r.stats = field->stats;
+    r.stats.split_cells = r.stats.rebuilt_trees = r.stats.waiting_cells = r.stats.unread_cells = 0;
+    r.second_moment = gsdi_pass_target(r.desc, field->passes) != GSD_TARGET_RADIANCE;
+    for (i = 0; i < field->block->cells; ++i)
+        samples += field->states[i].fresh;
+    gsdi_pass_scale(&r, pass, samples);
+    nodes = gsdi_refine_plan(&r, parallel, user);
+    if (!nodes || !gsdi_refine_allocate(&r, nodes)) {
+        gsdi_refinement_free(&r);
+        return GSD_OUT_OF_MEMORY;
+    }
+    /* nothing can fail from here */
+    gsdi_judge_cells(&r, samples);
+    gsdi_block_uniform(r.block);
+    memcpy(gsdi_words(r.block, r.block->spatial_at), r.spatial, r.spatial_count * sizeof(uint32_t));
+    gsdi_block_grid(r.block);
+    gsdi_run(parallel, user, field->block->cells, 16, gsdi_write_trees, &r);
+    gsdi_run(parallel, user, r.cells, 16, gsdi_write_cells, &r);
+    memcpy((char *)r.block + r.block->trees_at, r.trees, r.tree_count * sizeof(gsdi_tree));
+    gsdi_refine_commit(&r, pass, nodes, samples);
+    return GSD_OK;
+}
+
+/* ---- field: options, life and statistics */
+
+GSD_API const char *gsd_result_string(gsd_result result)
+{
+#define GSD_RESULT_TEXT(name, text) text,
+    static const char *const texts[] = {GSD_RESULTS(GSD_RESULT_TEXT) ""};
+#undef GSD_RESULT_TEXT
+    return (unsigned)result < (unsigned)GSD_RESULT_COUNT ? texts[result] : "unknown result";
+}
+
+/* The best level of this machine, or the pinned one; GSD_SIMD_AUTO where that is not available. */
+static gsd_simd gsdi_simd(gsd_simd wanted)
+{
+#if GSDI_X86
+    bool avx2, avx512;
+    __builtin_cpu_init();
+    avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+    avx512 = avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
+             __builtin_cpu_supports("avx512vl");
+    if (wanted == GSD_SIMD_AUTO)
+        return avx512 ? GSD_SIMD_AVX512 : avx2 ? GSD_SIMD_AVX2 : GSD_SIMD_SCALAR;
+    if ((wanted == GSD_SIMD_AVX2 && !avx2) || (wanted == GSD_SIMD_AVX512 && !avx512))
+        return GSD_SIMD_AUTO;
+    return wanted;
+#else
+    return wanted == GSD_SIMD_AUTO || wanted == GSD_SIMD_SCALAR ? GSD_SIMD_SCALAR : GSD_SIMD_AUTO;
+#endif
+}
+
+static void gsdi_default_u32(uint32_t *x, uint32_t value) { *x = *x ? *x : value; }
+static void gsdi_default_float(float *x, float value) { *x = *x != 0 ? *x : value; }
+static bool gsdi_within(double x, double low, double high) { return x >= low && x <= high; }
+
+static bool gsdi_bounds_ok(const gsd_desc *d)
+{
+    double extent = 0;
+    int i;
+    for (i = 0; i < 3; ++i) {
+        double e = (double)d->bounds_max[i] - (double)d->bounds_min[i];
+        if (!(e >= 0) || !(e < 1e30) || !(fabsf(d->bounds_min[i]) < 1e30f))
+            return false;
+        extent = e > extent ? e : extent;
+    }
+    return extent > 1e-30;
+}
+
+GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
+{
+    gsd_desc d = *desc;
+    if (!d.allocate != !d.release)
+        return GSD_BAD_ALLOCATOR;
+    if (!d.allocate) {
+        d.allocate = gsdi_default_allocate;
+        d.release = gsdi_default_release;
+    }
+    d.target = d.target ? d.target : GSD_TARGET_SWITCHING;
+    d.spatial_filter = d.spatial_filter ? d.spatial_filter : GSD_SPATIAL_NEAREST;
+    d.directional_filter = d.directional_filter ? d.directional_filter : GSD_DIRECTIONAL_BOX;
+    d.alpha_mode = d.alpha_mode ? d.alpha_mode : GSD_ALPHA_GRID;
+    gsdi_default_u32(&d.switch_pass, 4);
+    gsdi_default_float(&d.split_samples, 4000);
+    gsdi_default_float(&d.rho, 0.01f);
+    gsdi_default_u32(&d.max_depth, 16);
+    gsdi_default_u32(&d.max_levels, 48);
+    gsdi_default_u32(&d.min_samples, 64);
+    d.max_bytes = d.max_bytes ? d.max_bytes : (uint64_t)1 << 30;
+    gsdi_default_float(&d.alpha, 0.5f);
+    gsdi_default_float(&d.uniform, 0.01f);
+    gsdi_default_float(&d.gate_margin, 0.15f);
+    gsdi_default_u32(&d.gate_probe, 1);
+    if ((unsigned)d.target > GSD_TARGET_SWITCHING || (unsigned)d.spatial_filter > GSD_SPATIAL_STOCHASTIC ||
+        (unsigned)d.directional_filter > GSD_DIRECTIONAL_BOX || (unsigned)d.alpha_mode > GSD_ALPHA_GRID ||
+        (unsigned)d.simd > GSD_SIMD_AVX512)
+        return GSD_BAD_OPTION;
+    d.simd = gsdi_simd(d.simd);
+    if (d.simd == GSD_SIMD_AUTO)
+        return GSD_BAD_OPTION;
+    if (!gsdi_within(d.switch_pass, 1, 1000) || !gsdi_within((double)d.split_samples, 16, 1e9) ||
+        !gsdi_within((double)d.rho, 0.99e-5, 1) || !gsdi_within(d.max_depth, 1, 20) ||
+        !gsdi_within(d.max_levels, 1, 60) || !gsdi_within((double)d.alpha, 0.0499, 1) ||
+        !gsdi_within((double)d.uniform, 0.99e-4, 1) || !gsdi_within((double)d.gate_margin, 0.99e-3, 10) ||
+        !gsdi_within(d.gate_probe, 1, 1000) || d.max_bytes < 1u << 20 || d.forest_cells > GSDI_MAX_CELLS)
+        return GSD_BAD_RANGE;
+    if (!d.forest_cells && !gsdi_bounds_ok(&d))
+        return GSD_BAD_BOUNDS;
+    *resolved = d;
+    return GSD_OK;
+}
+
+/* Nodes of the even tree that a cell starts with. */
+static uint32_t gsdi_start_nodes(uint32_t depth) { return ((4u << (2 * depth)) - 1) / 3; }
+
+static void gsdi_start_tree(uint32_t *child, uint32_t depth)
+{
+    uint32_t i, inner = depth ? gsdi_start_nodes(depth - 1) : 0, total = gsdi_start_nodes(depth);
+    for (i = 0; i < total; ++i)
+        child[i] = i < inner ? 4 * i + 1 : 0;
+}
+
+static void gsdi_start_state(const gsd_desc *desc, gsdi_state *s, uint32_t first, uint32_t count)
+{
+    memset(s, 0, sizeof *s);
+    s->first = first;
+    s->count = count;
+    s->alpha = desc->alpha;
+    s->theta = desc->alpha < 0.98f ? logf(desc->alpha / (1 - desc->alpha)) : 4;
+}
+
+/* Depth of the starting trees: finer for the one cell of a spatial tree, since pass 0 learns only what it resolves. */
+static uint32_t gsdi_start_depth(const gsd_desc *desc)
+{
+    uint32_t depth = desc->forest_cells ? 3 : 4;
+    return depth < desc->max_depth ? depth : desc->max_depth;
+}
+
+static void gsdi_block_space(const gsd_desc *desc, gsdi_block *shape)
+{
+    double extent = 0;
+    int i;
+    for (i = 0; i < 3; ++i)
+        extent = fmax(extent, (double)desc->bounds_max[i] - (double)desc->bounds_min[i]);
+    extent *= 1.001;
+    extent = extent > 0 ? extent : 1;
+    for (i = 0; i < 3; ++i)
+        shape->origin[i] = (float)(0.5 * ((double)desc->bounds_min[i] + (double)desc->bounds_max[i]) - 0.5 * extent);
+    shape->scale = (float)(16777216.0 / extent);
+    shape->uniform = desc->uniform;
+}
+
+GSD_API gsd_result gsd_create(const gsd_desc *desc, gsd_field **out)
+{
+    gsd_desc d;
+    gsd_field *field;
+    gsdi_block shape;
+    gsdi_tree uniform;
+    gsd_result result;
+    uint32_t cells, nodes, depth, i;
+    *out = NULL;
+    result = gsd_resolve(desc, &d);
+    if (result)
+        return result;
+    field = (gsd_field *)gsdi_allocate(&d, 1, sizeof *field);
+    if (!field)
+        return GSD_OUT_OF_MEMORY;
+    field->desc = d;
+    cells = d.forest_cells ? d.forest_cells : 1;
+    depth = gsdi_start_depth(&d);
+    nodes = gsdi_start_nodes(depth);
+    memset(&shape, 0, sizeof shape);
+    memset(&uniform, 0, sizeof uniform);
+    gsdi_tree_shape(&d, &uniform, 0);
+    gsdi_block_places(&uniform, 1, &shape);
+    gsdi_block_space(&d, &shape);
+    shape.cells = cells;
+    shape.spatial = 1;
+    field->block = gsdi_block_allocate(&d, &shape, &field->memory);
+    field->states = (gsdi_state *)gsdi_allocate(&d, cells, sizeof *field->states);
+    field->child = (uint32_t *)gsdi_allocate(&d, (uint64_t)cells * nodes, sizeof(uint32_t));
+    field->sum = (double *)gsdi_allocate(&d, (uint64_t)cells * nodes, sizeof(double));
+    if (!field->block || !field->states || !field->child || !field->sum || (uint64_t)cells * nodes > 0xfffffff0u) {
+        gsd_destroy(field);
+        return GSD_OUT_OF_MEMORY;
+    }
+    gsdi_block_uniform(field->block);
+    memcpy((char *)field->block + field->block->trees_at, &uniform, sizeof uniform);
+    gsdi_words(field->block, field->block->spatial_at)[0] = GSD_CELL_BIT;
+    gsdi_block_grid(field->block);
+    field->building_nodes = field->node_capacity = cells * nodes;
+    field->state_capacity = cells;
+    for (i = 0; i < cells; ++i) {
+        gsdi_start_state(&d, &field->states[i], i * nodes, nodes);
+        gsdi_start_tree(field->child + (size_t)i * nodes, depth);
+        gsdi_cell_write(field->block, &uniform, &gsdi_cells(field->block)[i], &field->states[i], 0);
+    }
+    field->stats.peak_bytes = gsdi_bytes(field->block, field->building_nodes);
+    field->stats.effective_rho = d.rho;
+    field->stats.mean_alpha = 1;
+    gsdi_field_changed(field);
+    *out = field;
+    return GSD_OK;
+}
+
+GSD_API void gsd_destroy(gsd_field *field)
+{
+    gsd_desc desc;
+    if (!field)
+        return;
+    desc = field->desc;
+    gsdi_release(&desc, field->memory);
+    gsdi_release(&desc, field->states);
+    gsdi_release(&desc, field->child);
+    gsdi_release(&desc, field->sum);
+    gsdi_release(&desc, field->scratch);
+    gsdi_release(&desc, field);
+}
+
+GSD_API const gsd_desc *gsd_get_desc(const gsd_field *field) { return &field->desc; }
+GSD_API uint32_t gsd_cell_count(const gsd_field *field) { return field->block->cells; }
+GSD_API uint64_t gsd_structure_id(const gsd_field *field) { return field->structure; }
+GSD_API bool gsd_all_closed(const gsd_field *field) { return field->guiding == 0; }
+
+GSD_API float gsd_record_fraction(const gsd_field *field)
+{
+    float open = 1 - field->stats.closed_share;
+    return field->passes == 0 || open > 0.5f ? 1.0f : open + (1 - open) / 16;
+}
+
+GSD_API void gsd_get_stats(const gsd_field *field, gsd_stats *stats)
+{
+    gsdi_block *b = field->block;
+    const gsdi_tree *trees = gsdi_trees(b);
+    const gsd_cell *cells = gsdi_cells(b);
+    double depth = 0, learned = 0;
+    uint32_t i;
+    *stats = field->stats;
+    stats->cells = b->cells;
+    stats->trees = b->trees;
+    stats->nodes = stats->leaves = 0;
+    stats->building_nodes = field->building_nodes;
+    stats->bytes = gsdi_bytes(b, field->node_capacity);
+    stats->max_depth = 0;
+    for (i = 0; i < b->trees; ++i) {
+        stats->nodes += trees[i].groups * 4 + 1;
+        stats->leaves += trees[i].leaves;
+        stats->max_depth = trees[i].max_depth > stats->max_depth ? trees[i].max_depth : stats->max_depth;
+        depth += trees[i].groups ? (double)trees[i].mean_depth : 0;
+        learned += trees[i].groups ? 1 : 0;
+    }
+    stats->mean_depth = learned > 0 ? (float)(depth / learned) : 0;
+    stats->open_cells = stats->closed_cells = stats->unjudged_cells = 0;
+    for (i = 0; i < b->cells; ++i) {
+        stats->open_cells += cells[i].gate == GSD_GATE_OPEN;
+        stats->closed_cells += cells[i].gate == GSD_GATE_CLOSED;
+        stats->unjudged_cells += cells[i].gate == GSD_GATE_UNJUDGED;
+    }
+}
+
+/* ---- >>forest ----------------------------------------------------------------------------------------------- */
+
+/* Grow the cells of block and states to `cells`, and the building arrays by `nodes`. Capacity doubles. */
+static bool gsdi_forest_reserve(gsd_field *field, uint32_t cells, uint64_t nodes)
+{
+    const gsd_desc *d = &field->desc;
+    uint64_t wanted = field->building_nodes + nodes;
+    if (wanted > 0xfffffff0u)
+        return false;
+    if (cells > field->state_capacity) {
+        uint32_t capacity = cells + cells / 2;
+        gsdi_state *states = (gsdi_state *)gsdi_allocate(d, capacity, sizeof *states);
+        if (!states)
+            return false;
+        memcpy(states, field->states, field->block->cells * sizeof *states);
+        gsdi_release(d, field->states);
+        field->states = states;
+        field->state_capacity = capacity;
+    }
+    if (cells > field->block->cell_capacity) {
+        gsdi_block shape = *field->block, *block;
+        void *memory;
+        shape.cell_capacity = cells + cells / 2;
+        block = gsdi_block_allocate(d, &shape, &memory); /* the same offsets: cells come last */
+        if (!block)
+            return false;
+        memcpy((char *)block + sizeof *block, (char *)field->block + sizeof *block,
+               (size_t)field->block->size - sizeof *block);
+        gsdi_release(d, field->memory);
+        field->memory = memory;
+        field->block = block;
+    }
+    if (wanted > field->node_capacity) {
+        uint64_t capacity = wanted + wanted / 2 < 0xfffffff0u ? wanted + wanted / 2 : wanted;
+        uint32_t *child = (uint32_t *)gsdi_allocate(d, capacity, sizeof *child);
+        double *sum = (double *)gsdi_allocate(d, capacity, sizeof *sum);
+        if (!child || !sum) {
+            gsdi_release(d, child);
+            gsdi_release(d, sum);
+            return false;
+        }
+        memcpy(child, field->child, field->building_nodes * sizeof *child);
+        memcpy(sum, field->sum, field->building_nodes * sizeof *sum);
+        gsdi_release(d, field->child);
+        gsdi_release(d, field->sum);
+        field->child = child;
+        field->sum = sum;
+        field->node_capacity = (uint32_t)capacity;
+    }
+    return true;
+}
+
+/* Make `cell` a copy of `from` at the end of the building arrays. */
+static void gsdi_forest_copy(gsd_field *field, uint32_t cell, uint32_t from)
+{
+    gsdi_state *s = &field->states[cell];
+    *s = field->states[from];
+    memcpy(field->child + field->building_nodes, field->child + s->first, s->count * sizeof(uint32_t));
+    memcpy(field->sum + field->building_nodes, field->sum + s->first, s->count * sizeof(double));
+    s->first = field->building_nodes;
+    field->building_nodes += s->count;
+    field->guiding -= gsdi_cells(field->block)[cell].alpha < 1;
+    gsdi_cells(field->block)[cell] = gsdi_cells(field->block)[from];
+    field->guiding += gsdi_cells(field->block)[cell].alpha < 1;
+}
+
+GSD_API gsd_result gsd_forest_split(gsd_field *field, uint32_t parent, uint32_t child_a, uint32_t child_b)
+{
+    uint32_t old = field->block->cells, cells, depth = gsdi_start_depth(&field->desc), i, k;
+    uint32_t nodes = gsdi_start_nodes(depth), children[2];
+    gsdi_state *s;
+    if (!field->desc.forest_cells)
+        return GSD_NOT_A_FOREST;
+    if (parent >= old || child_a == child_b || child_a >= GSDI_MAX_CELLS || child_b >= GSDI_MAX_CELLS)
+        return GSD_BAD_CELL;
+    cells = child_a > child_b ? child_a + 1 : child_b + 1;
+    cells = cells > old ? cells : old;
+    if (!gsdi_forest_reserve(field, cells, (uint64_t)(cells - old) * nodes + 2ull * field->states[parent].count))
+        return GSD_OUT_OF_MEMORY;
+    for (i = old; i < cells; ++i) {
+        gsdi_start_state(&field->desc, &field->states[i], field->building_nodes, nodes);
+        gsdi_start_tree(field->child + field->building_nodes, depth);
+        memset(field->sum + field->building_nodes, 0, nodes * sizeof(double));
+        field->building_nodes += nodes;
+        gsdi_cell_write(field->block, gsdi_trees(field->block), &gsdi_cells(field->block)[i], &field->states[i], 0);
+    }
+    field->block->cells = cells;
+    s = &field->states[parent];
+    for (i = 0; i < s->count; ++i)
+        field->sum[s->first + i] *= 0.5;
+    s->held *= 0.5;
+    s->fresh *= 0.5;
+    s->gate_count *= 0.5;
+    for (k = 0; k <= GSDI_GATE_LOW; ++k) {
+        s->v[k] *= 0.5;
+        s->vv[k] *= 0.5;
+        if (k < GSDI_GATE_LOW)
+            s->cross[k] *= 0.5;
+    }
+    children[0] = child_a;
+    children[1] = child_b;
+    for (k = 0; k < 2; ++k)
+        if (children[k] != parent)
+            gsdi_forest_copy(field, children[k], parent);
+    field->structure = gsdi_hash(gsdi_hash(field->structure, (uint64_t)child_a << 32 | child_b), parent);
+    return GSD_OK;
+}
+
+#if defined(__clang__)
+#pragma STDC FP_CONTRACT DEFAULT
+#elif defined(__GNUC__)
+#pragma GCC pop_options
+#endif
+
+/* ---- >>batches ---------------------------------------------------------------------------------------------- */
+
+#define GSDI_LANES 16u /* queries in flight: enough to cover the latency of memory */
+
+static uint32_t gsdi_at(const uint32_t *index, uint32_t i) { return index ? index[i] : i; }
+static const float *gsdi_row(const float *base, size_t stride, uint32_t row)
+{
+    return (const float *)(const void *)((const char *)base + stride * row);
+}
+static float *gsdi_row_out(float *base, size_t stride, uint32_t row)
+{
+    return (float *)(void *)((char *)base + stride * row);
+}
+
+GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const float *positions,
+                            size_t position_stride, const float *u, size_t u_stride, gsd_handle *handles,
+                            float *alpha)
+{
+    uint32_t start, i, axis;
+    for (start = 0; start < count; start += GSDI_LANES) {
+        uint32_t n = count - start < GSDI_LANES ? count - start : GSDI_LANES;
+        uint32_t cell[GSDI_LANES], g[GSDI_LANES][3];
+        for (i = 0; i < n; ++i) {
+            const float *p = gsdi_row(positions, position_stride, gsdi_at(index, start + i));
+            for (axis = 0; axis < 3; ++axis)
+                g[i][axis] = gsd_grid_coordinate(p[axis], view->origin[axis], view->scale);
+            GSDI_PREFETCH(&view->grid[(g[i][0] >> 20) << 8 | (g[i][1] >> 20) << 4 | g[i][2] >> 20]);
+        }
+        for (i = 0; i < n; ++i) {
+            if (u) {
+                uint32_t at = gsdi_at(index, start + i);
+                handles[at] = gsd_find(view, gsdi_row(positions, position_stride, at), gsdi_row(u, u_stride, at));
+                cell[i] = handles[at].cell;
+            } else {
+                cell[i] = gsd_cell_at(view, g[i]);
+            }
+            GSDI_PREFETCH(&view->cells[cell[i]]);
+        }
+        for (i = 0; i < n; ++i) {
+            uint32_t at = gsdi_at(index, start + i);
+            handles[at] = gsd_find_cell(view, cell[i]);
+            if (alpha)
+                alpha[at] = handles[at].alpha;
+        }
+    }
+}
+
+/* Descend up to 16 trees together, one level of each in turn; node[i] ends at a leaf. */
+static void gsdi_descend(const gsd_view *view, uint32_t n, uint32_t *node, uint32_t (*xy)[2], uint32_t *shift)
+{
+    uint32_t lane[GSDI_LANES], active = n, i;
+    for (i = 0; i < n; ++i)
+        lane[i] = i;
+    while (active) {
+        uint32_t left = 0;
+        for (i = 0; i < active; ++i) {
+            uint32_t l = lane[i], child = view->nodes[node[l]].inner.child, s;
+            if (!child)
+                continue;
+            s = --shift[l];
+            node[l] = child + ((xy[l][0] >> s) & 1u) + 2 * ((xy[l][1] >> s) & 1u);
+            GSDI_PREFETCH(&view->nodes[node[l]]);
+            lane[left++] = l;
+        }
+        active = left;
+    }
+}
+
+GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const gsd_handle *handles,
+                           const float *directions, size_t direction_stride, float *pdf)
+{
+    uint32_t start, i;
+    for (start = 0; start < count; start += GSDI_LANES) {
+        uint32_t n = count - start < GSDI_LANES ? count - start : GSDI_LANES;
+        uint32_t node[GSDI_LANES], xy[GSDI_LANES][2], shift[GSDI_LANES];
+        for (i = 0; i < n; ++i) {
+            uint32_t at = gsdi_at(index, start + i);
+            const gsd_handle *h = &handles[at];
+            gsd_coordinates(gsdi_row(directions, direction_stride, at), &xy[i][0], &xy[i][1]);
+            shift[i] = h->jump;
+            node[i] = h->jump ? h->jump + (xy[i][1] >> 21) * 8 + (xy[i][0] >> 21) : h->root;
+            if (h->jump)
+                GSDI_PREFETCH(&view->jumps[node[i]]);
+            else
+                GSDI_PREFETCH(&view->nodes[node[i]]);
+        }
+        for (i = 0; i < n; ++i) {
+            if (shift[i]) {
+                node[i] = view->jumps[node[i]];
+                GSDI_PREFETCH(&view->nodes[node[i]]);
+            }
+            shift[i] = shift[i] ? 21 : 24;
+        }
+        gsdi_descend(view, n, node, xy, shift);
+        for (i = 0; i < n; ++i)
+            pdf[gsdi_at(index, start + i)] = view->nodes[node[i]].leaf.pdf;
+    }
+}
+
+/* State of one sampling query. */
+typedef struct gsdi_draw {
+    double r[2], lo[2], width[2];
+    uint32_t node;
+} gsdi_draw;
+
+/* Follow the inverse distribution of up to 16 draws to leaves, one level of each in turn; see gsd_sample. */
+static void gsdi_draw_descend(const gsd_view *view, uint32_t n, gsdi_draw *draws, const bool *tree)
+{
+    uint32_t lane[GSDI_LANES], active = 0, i;
+    for (i = 0; i < n; ++i)
+        if (tree[i])
+            lane[active++] = i;
+    while (active) {
+        uint32_t left = 0;
+        for (i = 0; i < active; ++i) {
+            gsdi_draw *d = &draws[lane[i]];
+            const gsd_node *node = &view->nodes[d->node];
+            uint32_t child = node->inner.child, bx, by;
+            double w;
+            if (!child)
+                continue;
+            w = d->width[0] * (double)node->inner.split[0];
+            bx = (uint32_t)(d->r[0] >= d->lo[0] + w) & (uint32_t)(w < d->width[0]);
+            d->lo[0] = bx ? d->lo[0] + w : d->lo[0];
+            d->width[0] = bx ? d->width[0] - w : w;
+            w = d->width[1] * (double)node->inner.split[1 + bx];
+            by = (uint32_t)(d->r[1] >= d->lo[1] + w) & (uint32_t)(w < d->width[1]);
+            d->lo[1] = by ? d->lo[1] + w : d->lo[1];
+            d->width[1] = by ? d->width[1] - w : w;
+            d->node = child + bx + 2 * by;
+            GSDI_PREFETCH(&view->nodes[d->node]);
+            lane[left++] = lane[i];
+        }
+        active = left;
+    }
+    for (i = 0; i < n; ++i)
+        if (tree[i]) {
+            draws[i].r[0] = (draws[i].r[0] - draws[i].lo[0]) / draws[i].width[0];
+            draws[i].r[1] = (draws[i].r[1] - draws[i].lo[1]) / draws[i].width[1];
+        }
+}
+
+/* Start one draw: 0 = uniform share (r is the place on the sphere), 1 = descend, 2 = alias slot in node. */
+static int gsdi_draw_start(const gsd_view *view, const gsd_handle *h, const float *u, gsdi_draw *d)
+{
+    double e = (double)view->uniform;
+    gsd_extend_random(u, d->r);
+    d->lo[0] = d->lo[1] = 0;
+    d->width[0] = d->width[1] = 1;
+    d->node = h->root;
+    if (d->r[0] < e) {
+        d->r[0] /= e;
+        return 0;
+    }
+    d->r[0] = (d->r[0] - e) / (1 - e);
+    d->r[0] = d->r[0] < 0.99999999988 ? d->r[0] : 0.99999999988;
+    if (h->alias_count) {
+        double slot = d->r[0] * (double)h->alias_count;
+        d->node = h->alias + (uint32_t)slot;
+        d->r[0] = slot - (double)(uint32_t)slot;
+        GSDI_PREFETCH(&view->aliases[d->node]);
+        return 2;
+    }
+    GSDI_PREFETCH(&view->nodes[d->node]);
+    return 1;
+}
+
+/* Choose between the two leaves of an alias slot. */
+static void gsdi_draw_alias(const gsd_view *view, gsdi_draw *d)
+{
+    const gsd_alias *a = &view->aliases[d->node];
+    double t = (double)a->threshold;
+    bool own = d->r[0] < t;
+    d->r[0] = own ? d->r[0] / t : (d->r[0] - t) / (1 - t);
+    d->node = own ? a->node : a->other;
+    GSDI_PREFETCH(&view->nodes[d->node]);
+}
+
+GSD_API void gsd_sample_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const gsd_handle *handles,
+                              const float *u, size_t u_stride, float *directions, size_t direction_stride, float *pdf)
+{
+    uint32_t start, i;
+    for (start = 0; start < count; start += GSDI_LANES) {
+        uint32_t n = count - start < GSDI_LANES ? count - start : GSDI_LANES;
+        gsdi_draw draws[GSDI_LANES];
+        int kind[GSDI_LANES];
+        bool tree[GSDI_LANES];
+        for (i = 0; i < n; ++i) {
+            uint32_t at = gsdi_at(index, start + i);
+            kind[i] = gsdi_draw_start(view, &handles[at], gsdi_row(u, u_stride, at), &draws[i]);
+            tree[i] = kind[i] == 1;
+        }
+        for (i = 0; i < n; ++i)
+            if (kind[i] == 2)
+                gsdi_draw_alias(view, &draws[i]);
+        gsdi_draw_descend(view, n, draws, tree);
+        for (i = 0; i < n; ++i) {
+            uint32_t at = gsdi_at(index, start + i);
+            float *out = gsdi_row_out(directions, direction_stride, at);
+            if (kind[i] == 0) {
+                gsd_direction(draws[i].r[0] * 16777216.0, draws[i].r[1] * 16777216.0, out);
+                pdf[at] = gsd_pdf(view, &handles[at], out);
+            } else {
+                pdf[at] = gsd_sample_leaf(view, &handles[at], draws[i].node, draws[i].r[0], draws[i].r[1], out);
+            }
+        }
+    }
+}
+
+/* ---- >>files ------------------------------------------------------------------------------------------------ */
+
+/* Start of a save. Then gsdi_block and what follows it, states, child, sum. */
+typedef struct gsdi_file {
+    char magic[8];
+    uint32_t byte_order, version;
+    uint64_t size, checksum; /* of the whole save with checksum = 0 */
+    uint64_t block_size, structure;
+    uint64_t samples, zeros, rejected, refused, clamped, lost, opened, closed, probed, peak_bytes, max_bytes;
+    double first_pass_samples, last_pass_samples;
+    uint32_t cells, building_nodes, passes, first_pass_spp;
+    uint32_t target, switch_pass, max_depth, max_levels, min_samples, spatial_filter, directional_filter, alpha_mode;
+    uint32_t no_gate, no_guide_weight, no_history, alias, gate_probe, forest_cells;
+    float bounds_min[3], bounds_max[3];
+    float split_samples, rho, alpha, uniform, gate_margin, closed_share, mean_alpha, effective_rho;
+} gsdi_file;
+
+#define GSDI_MAGIC "GSDTREE"
+#define GSDI_BYTE_ORDER 0x01020304u
+
+static uint64_t gsdi_file_size(uint64_t block_size, uint64_t cells, uint64_t nodes)
+{
+    return sizeof(gsdi_file) + block_size + cells * sizeof(gsdi_state) + nodes * (sizeof(uint32_t) + sizeof(double));
+}
+
+/* Block size without the room to grow. */
+static uint64_t gsdi_block_used(const gsdi_block *b) { return b->cells_at + (uint64_t)b->cells * sizeof(gsd_cell); }
+
+GSD_API size_t gsd_save_bound(const gsd_field *field)
+{
+    return (size_t)gsdi_file_size(gsdi_block_used(field->block), field->block->cells, field->building_nodes);
+}
+
+static void gsdi_file_options(gsdi_file *f, const gsd_desc *d)
+{
+    f->target = (uint32_t)d->target;
+    f->switch_pass = d->switch_pass;
+    f->max_depth = d->max_depth;
+    f->max_levels = d->max_levels;
+    f->min_samples = d->min_samples;
+    f->spatial_filter = (uint32_t)d->spatial_filter;
+    f->directional_filter = (uint32_t)d->directional_filter;
+    f->alpha_mode = (uint32_t)d->alpha_mode;
+    f->no_gate = d->no_gate;
+    f->no_guide_weight = d->no_guide_weight;
+    f->no_history = d->no_history;
+    f->alias = d->alias;
+    f->gate_probe = d->gate_probe;
+    f->forest_cells = d->forest_cells;
+    f->max_bytes = d->max_bytes;
+    memcpy(f->bounds_min, d->bounds_min, sizeof f->bounds_min);
+    memcpy(f->bounds_max, d->bounds_max, sizeof f->bounds_max);
+    f->split_samples = d->split_samples;
+    f->rho = d->rho;
+    f->alpha = d->alpha;
+    f->uniform = d->uniform;
+    f->gate_margin = d->gate_margin;
+}
+
+static gsd_result gsdi_file_desc(const gsdi_file *f, const gsd_desc *given, gsd_desc *d)
+{
+    memset(d, 0, sizeof *d);
+    d->target = (gsd_target)(f->target & 0xffu);
+    d->switch_pass = f->switch_pass;
+    d->max_depth = f->max_depth;
+    d->max_levels = f->max_levels;
+    d->min_samples = f->min_samples;
+    d->spatial_filter = (gsd_spatial_filter)(f->spatial_filter & 0xffu);
+    d->directional_filter = (gsd_directional_filter)(f->directional_filter & 0xffu);
+    d->alpha_mode = (gsd_alpha_mode)(f->alpha_mode & 0xffu);
+    d->no_gate = f->no_gate != 0;
+    d->no_guide_weight = f->no_guide_weight != 0;
+    d->no_history = f->no_history != 0;
+    d->alias = f->alias != 0;
+    d->gate_probe = f->gate_probe;
+    d->forest_cells = f->forest_cells;
+    d->max_bytes = f->max_bytes;
+    memcpy(d->bounds_min, f->bounds_min, sizeof d->bounds_min);
+    memcpy(d->bounds_max, f->bounds_max, sizeof d->bounds_max);
+    d->split_samples = f->split_samples;
+    d->rho = f->rho;
+    d->alpha = f->alpha;
+    d->uniform = f->uniform;
+    d->gate_margin = f->gate_margin;
+    if (given) {
+        d->allocate = given->allocate;
+        d->release = given->release;
+        d->user = given->user;
+        d->simd = given->simd;
+    }
+    return gsd_resolve(d, d);
+}
+
+static void gsdi_file_counters(gsdi_file *f, const gsd_stats *s)
+{
+    f->samples = s->samples;
+    f->zeros = s->zeros;
+    f->rejected = s->rejected;
+    f->refused = s->refused;
+    f->clamped = s->clamped;
+    f->lost = s->lost;
+    f->opened = s->opened;
+    f->closed = s->closed;
+    f->probed = s->probed;
+    f->peak_bytes = s->peak_bytes;
+    f->closed_share = s->closed_share;
+    f->mean_alpha = s->mean_alpha;
+    f->effective_rho = s->effective_rho;
+}
+
+static void gsdi_counters_file(gsd_stats *s, const gsdi_file *f)
+{
+    s->samples = f->samples;
+    s->zeros = f->zeros;
+    s->rejected = f->rejected;
+    s->refused = f->refused;
+    s->clamped = f->clamped;
+    s->lost = f->lost;
+    s->opened = f->opened;
+    s->closed = f->closed;
+    s->probed = f->probed;
+    s->peak_bytes = f->peak_bytes;
+    s->closed_share = f->closed_share;
+    s->mean_alpha = f->mean_alpha;
+    s->effective_rho = f->effective_rho;
+    s->passes = f->passes;
+}
+
+static uint64_t gsdi_file_checksum(const gsdi_file *f, const unsigned char *rest, size_t rest_size)
+{
+    gsdi_file zero;
+    memcpy(&zero, f, sizeof zero);
+    zero.checksum = 0;
+    return gsdi_hash_bytes(gsdi_hash_bytes(0x452821e638d01377ull, &zero, sizeof zero), rest, rest_size);
+}
+
+/* Copy and go on behind the copy. */
+static unsigned char *gsdi_put(unsigned char *to, const void *from, size_t size)
+{
+    memcpy(to, from, size);
+    return to + size;
+}
+
+GSD_API gsd_result gsd_save(const gsd_field *field, void *data, size_t capacity, size_t *size)
+{
+    const gsdi_block *b = field->block;
+    gsdi_block shape = *b;
+    gsdi_file f;
+    unsigned char *at = (unsigned char *)data;
+    uint32_t nodes = field->building_nodes;
+    *size = 0;
+    if (capacity < gsd_save_bound(field))
+        return GSD_BUFFER_TOO_SMALL;
+    memset(&f, 0, sizeof f);
+    memcpy(f.magic, GSDI_MAGIC, sizeof GSDI_MAGIC);
+    f.byte_order = GSDI_BYTE_ORDER;
+    f.version = GSD_VERSION;
+    f.size = gsd_save_bound(field);
+    f.block_size = gsdi_block_used(b);
+    f.structure = field->structure;
+    f.first_pass_samples = field->first_pass_samples;
+    f.last_pass_samples = field->last_pass_samples;
+    f.cells = b->cells;
+    f.building_nodes = nodes;
+    f.passes = field->passes;
+    f.first_pass_spp = field->first_pass_spp;
+    gsdi_file_options(&f, &field->desc);
+    gsdi_file_counters(&f, &field->stats);
+    shape.cell_capacity = shape.cells;
+    shape.size = f.block_size;
+    at = gsdi_put(at, &f, sizeof f);
+    at = gsdi_put(at, &shape, sizeof shape);
+    at = gsdi_put(at, (const char *)b + sizeof shape, (size_t)f.block_size - sizeof shape);
+    at = gsdi_put(at, field->states, b->cells * sizeof(gsdi_state));
+    at = gsdi_put(at, field->child, nodes * sizeof(uint32_t));
+    gsdi_put(at, field->sum, nodes * sizeof(double));
+    f.checksum = gsdi_file_checksum(&f, (const unsigned char *)data + sizeof f, (size_t)f.size - sizeof f);
+    memcpy(data, &f, sizeof f);
+    *size = (size_t)f.size;
+    return GSD_OK;
+}
+
+/* Header of a save: sizes add up, checksum is right. */
+static gsd_result gsdi_file_check(const unsigned char *data, size_t size, gsdi_file *f)
+{
+    if (size < sizeof *f + sizeof(gsdi_block))
+        return GSD_BAD_FILE;
+    memcpy(f, data, sizeof *f);
+    if (memcmp(f->magic, GSDI_MAGIC, sizeof GSDI_MAGIC) != 0)
+        return GSD_BAD_FILE;
+    if (f->byte_order != GSDI_BYTE_ORDER || f->version != GSD_VERSION)
+        return GSD_BAD_VERSION;
+    if (f->size != size || f->block_size > size || f->block_size < sizeof(gsdi_block) || f->cells == 0 ||
+        f->building_nodes == 0 || f->cells > GSDI_MAX_CELLS ||
+        gsdi_file_size(f->block_size, f->cells, f->building_nodes) != f->size ||
+        f->checksum != gsdi_file_checksum(f, data + sizeof *f, size - sizeof *f))
+        return GSD_BAD_FILE;
+    return GSD_OK;
+}
+
+/* The block's own header agrees with what its counts imply. */
+static bool gsdi_block_shape_ok(const gsdi_block *b, const gsdi_file *f, const gsd_desc *d)
+{
+    gsdi_block shape = *b, space = *b;
+    if (b->cells != f->cells || b->cell_capacity != b->cells || b->trees == 0 || b->nodes < 4 || b->nodes % 4 ||
+        b->jumps < 64 || b->jumps % 64 || b->spatial == 0 || b->roots < 4 || b->roots % 4 || b->roots > b->nodes)
+        return false;
+    gsdi_block_layout(&shape);
+    gsdi_block_space(d, &space);
+    return memcmp(&shape, b, sizeof shape) == 0 && shape.size == f->block_size &&
+           memcmp(space.origin, b->origin, sizeof b->origin) == 0 && memcmp(&space.scale, &b->scale, 4) == 0 &&
+           memcmp(&space.uniform, &b->uniform, 4) == 0;
+}
+
+GSD_API gsd_result gsd_load(const gsd_desc *desc, const void *data, size_t size, gsd_field **out)
+{
+    const unsigned char *at = (const unsigned char *)data + sizeof(gsdi_file);
+    gsdi_file f;
+    gsdi_block shape;
+    gsd_desc d;
+    gsd_field *field;
+    gsd_result result;
+    *out = NULL;
+    result = gsdi_file_check((const unsigned char *)data, size, &f);
+    if (result)
+        return result;
+    result = gsdi_file_desc(&f, desc, &d);
+    if (result)
+        return result == GSD_BAD_ALLOCATOR ? result : GSD_BAD_FILE;
+    memcpy(&shape, at, sizeof shape);
+    if (!gsdi_block_shape_ok(&shape, &f, &d))
+        return GSD_BAD_FILE;
+    field = (gsd_field *)gsdi_allocate(&d, 1, sizeof *field);
+    if (!field)
+        return GSD_OUT_OF_MEMORY;
+    field->desc = d;
+    field->block = gsdi_block_allocate(&d, &shape, &field->memory);
+    field->states = (gsdi_state *)gsdi_allocate(&d, f.cells, sizeof *field->states);
+    field->child = (uint32_t *)gsdi_allocate(&d, f.building_nodes, sizeof(uint32_t));
+    field->sum = (double *)gsdi_allocate(&d, f.building_nodes, sizeof(double));
+    if (!field->block || !field->states || !field->child || !field->sum) {
+        gsd_destroy(field);
+        return GSD_OUT_OF_MEMORY;
+    }
+    memcpy(field->block, at, (size_t)f.block_size);
+    at += f.block_size;
+    memcpy(field->states, at, f.cells * sizeof *field->states);
+    at += f.cells * sizeof *field->states;
+    memcpy(field->child, at, f.building_nodes * sizeof(uint32_t));
+    at += f.building_nodes * sizeof(uint32_t);
+    memcpy(field->sum, at, f.building_nodes * sizeof(double));
+    field->building_nodes = field->node_capacity = f.building_nodes;
+    field->state_capacity = f.cells;
+    field->passes = f.passes;
+    field->first_pass_spp = f.first_pass_spp;
+    field->first_pass_samples = f.first_pass_samples;
+    field->last_pass_samples = f.last_pass_samples;
+    gsdi_counters_file(&field->stats, &f);
+    if (gsd_validate(field)) {
+        gsd_destroy(field);
+        return GSD_BAD_FILE;
+    }
+    gsdi_field_changed(field);
+    field->structure = f.structure;
+    *out = field;
+    return GSD_OK;
+}
+
+/* ---- validation */
+
+static bool gsdi_share_ok(float x) { return x >= 0 && x <= 1; }
+
+/* One sampling tree: children in its own range, each group used once and later than its parent, leaves where their
+   path says. */
+static bool gsdi_tree_ok(const gsd_view *view, const gsdi_block *b, const gsdi_tree *tree, uint32_t max_depth)
+{
+    gsdi_visit stack[GSDI_STACK];
+    uint32_t used = 0, k;
+    int top = 0;
+    if (tree->groups == 0)
+        return tree->root == 0 && tree->jump == 0;
+    if (tree->root < 4 || tree->root >= b->roots || tree->first < b->roots || (tree->first - b->roots) % 4 ||
+        (uint64_t)tree->first + (uint64_t)tree->groups * 4 > b->nodes)
+        return false;
+    memset(&stack[0], 0, sizeof stack[0]);
+    stack[0].node = tree->root;
+    while (top >= 0) {
+        gsdi_visit v = stack[top--];
+        const gsd_node *n = &view->nodes[v.node];
+        if (n->inner.child == 0) {
+            if (!(n->leaf.pdf > 0) || !(n->leaf.pdf < 1e30f) || n->leaf.x != (v.x | v.depth << 24) || n->leaf.y != v.y)
+                return false;
+            continue;
+        }
+        if (n->inner.child != tree->first + used * 4 || used >= tree->groups || v.depth >= max_depth ||
+            !gsdi_share_ok(n->inner.split[0]) || !gsdi_share_ok(n->inner.split[1]) || !gsdi_share_ok(n->inner.split[2]))
+            return false;
+        used++;
+        for (k = 4; k-- > 0;) {
+            gsdi_visit *s = &stack[++top];
+            s->node = n->inner.child + k;
+            s->depth = v.depth + 1;
+            s->x = v.x + (k & 1) * (16777216u >> s->depth);
+            s->y = v.y + (k >> 1) * (16777216u >> s->depth);
+        }
+    }
+    return used == tree->groups;
+}
+
+static bool gsdi_jumps_ok(const gsd_view *view, const gsdi_block *b, const gsdi_tree *tree)
+{
+    uint32_t i, k;
+    if (tree->jump == 0)
+        return true;
+    if (tree->jump % 64 || tree->jump > b->jumps - 64)
+        return false;
+    for (i = 0; i < 64; ++i) {
+        uint32_t node = tree->root;
+        for (k = 0; k < 3 && view->nodes[node].inner.child; ++k)
+            node = view->nodes[node].inner.child + ((i >> (2 - k)) & 1u) + 2 * ((i >> (5 - k)) & 1u);
+        if (view->jumps[tree->jump + i] != node)
+            return false;
+    }
+    return true;
+}
+
+static bool gsdi_aliases_ok(const gsd_view *view, const gsdi_block *b, const gsdi_tree *tree)
+{
+    uint32_t i;
+    uint32_t low = tree->first, high = tree->first + tree->groups * 4;
+    if (tree->groups == 0 || b->aliases == 0)
+        return true;
+    if (tree->leaves != 3 * tree->groups + 1 || (uint64_t)tree->alias + tree->leaves > b->aliases)
+        return false;
+    for (i = 0; i < tree->leaves; ++i) {
+        const gsd_alias *a = &view->aliases[tree->alias + i];
+        if (!gsdi_share_ok(a->threshold) || a->node < low || a->node >= high || a->other < low || a->other >= high ||
+            view->nodes[a->node].inner.child || view->nodes[a->other].inner.child)
+            return false;
+    }
+    return true;
+}
+
+/* The spatial tree: every node reached once, every cell once (forests: only cell 0), levels and corners as the states
+   say. */
+static bool gsdi_spatial_ok(const gsd_field *field, const gsd_view *view)
+{
+    struct gsdi_corner {
+        uint32_t node, level, origin[3];
+    } stack[64];
+    const gsdi_block *b = field->block;
+    uint32_t nodes = 1, cells = 0, i;
+    int top = 0;
+    memset(&stack[0], 0, sizeof stack[0]);
+    while (top >= 0) {
+        struct gsdi_corner c = stack[top--], *next;
+        uint32_t link = view->spatial[c.node], axis = c.level % 3;
+        if (link & GSD_CELL_BIT) {
+            uint32_t cell = link & ~GSD_CELL_BIT;
+            if (cell >= b->cells || field->states[cell].level != c.level ||
+                memcmp(field->states[cell].origin, c.origin, sizeof c.origin) != 0)
+                return false;
+            cells++;
+            continue;
+        }
+        if (link <= c.node || link > b->spatial - 2 || b->spatial < 3 || c.level >= 60 || nodes >= b->spatial)
+            return false;
+        nodes += 2;
+        for (i = 0; i < 2; ++i) {
+            next = &stack[++top];
+            *next = c;
+            next->node = link + i;
+            next->level = c.level + 1;
+            next->origin[axis] += i * gsd_cell_extent(next->level, axis);
+        }
+    }
+    if (nodes != b->spatial || cells != (field->desc.forest_cells ? 1 : b->cells))
+        return false;
+    for (i = 0; i < GSDI_GRID; ++i)
+        if (view->grid[i] != gsdi_grid_link(view->spatial, i >> 8, (i >> 4) & 15u, i & 15u))
+            return false;
+    return true;
+}
+
+/* One building tree: children later than parents, all nodes used, leaves' sums finite and >= 0. */
+static bool gsdi_building_ok(const gsd_field *field, const gsdi_state *s)
+{
+    const uint32_t *child;
+    const double *sum;
+    uint32_t used = 1, top = 0, k;
+    struct gsdi_down {
+        uint32_t node, depth;
+    } stack[GSDI_STACK], v;
+    if (s->count == 0 || s->count > field->building_nodes || s->first > field->building_nodes - s->count)
+        return false;
+    child = field->child + s->first;
+    sum = field->sum + s->first;
+    stack[top].node = stack[top].depth = 0;
+    ++top;
+    while (top) {
+        v = stack[--top];
+        if (child[v.node] == 0) {
+            if (!(sum[v.node] >= 0) || !(sum[v.node] < 1e300))
+                return false;
+            continue;
+        }
+        if (child[v.node] <= v.node || s->count < 5 || child[v.node] > s->count - 4 || used >= s->count ||
+            v.depth >= field->desc.max_depth)
+            return false;
+        used += 4;
+        for (k = 0; k < 4; ++k, ++top) {
+            stack[top].node = child[v.node] + k;
+            stack[top].depth = v.depth + 1;
+        }
+    }
+    return used == s->count;
+}
+
+static bool gsdi_state_ok(const gsd_field *field, const gsdi_state *s, const gsd_cell *c, const gsdi_tree *trees)
+{
+    const gsdi_tree *t;
+    gsd_cell should;
+    uint32_t k;
+    if (c->tree >= field->block->trees || s->gate > GSD_GATE_CLOSED || !(s->alpha >= 0.049f && s->alpha <= 1) ||
+        !(s->theta > -10 && s->theta < 10) || !gsdi_finite(s->moment1) || !gsdi_finite(s->moment2) ||
+        !(s->held >= 0 && s->held < 1e18) || !(s->fresh >= 0 && s->fresh < 1e18) || !(s->gate_count >= 0) ||
+        s->level > 60)
+        return false;
+    for (k = 0; k <= GSDI_GATE_LOW; ++k)
+        if (!(s->v[k] >= 0 && s->v[k] < 1e300) || !(s->vv[k] >= 0 && s->vv[k] < 1e300))
+            return false;
+    for (k = 0; k < GSDI_GATE_LOW; ++k)
+        if (!(s->cross[k] >= 0 && s->cross[k] < 1e300))
+            return false;
+    t = &trees[c->tree];
+    gsdi_cell_write(field->block, t, &should, s, 0);
+    should.tree = c->tree;
+    should.alpha = c->alpha;
+    should.gate = c->gate;
+    return memcmp(&should, c, sizeof should) == 0 && c->alpha >= 0.049f && c->alpha <= 1 &&
+           c->gate <= GSD_GATE_CLOSED && gsdi_building_ok(field, s);
+}
+
+GSD_API gsd_result gsd_validate(const gsd_field *field)
+{
+    const gsdi_block *b = field->block;
+    const gsdi_tree *trees = gsdi_trees(b);
+    gsd_view view = gsd_get_view(field);
+    uint32_t i;
+    for (i = 0; i < b->roots; ++i)
+        if (i < 4 && (view.nodes[i].leaf.child || memcmp(&view.nodes[i].leaf.pdf, &view.nodes[0].leaf.pdf, 4) ||
+                      !(fabsf(view.nodes[i].leaf.pdf - GSD_INV_4PI) < 1e-7f)))
+            return GSD_CORRUPT;
+    if (trees[0].groups)
+        return GSD_CORRUPT;
+    for (i = 0; i < b->trees; ++i)
+        if (!gsdi_tree_ok(&view, b, &trees[i], field->desc.max_depth) || !gsdi_jumps_ok(&view, b, &trees[i]) ||
+            !gsdi_aliases_ok(&view, b, &trees[i]))
+            return GSD_CORRUPT;
+    for (i = 0; i < b->cells; ++i)
+        if (!gsdi_state_ok(field, &field->states[i], &view.cells[i], trees))
+            return GSD_CORRUPT;
+    return gsdi_spatial_ok(field, &view) ? GSD_OK : GSD_CORRUPT;
+}
+
+/* ---- merge, export, import */
+
+GSD_API gsd_result gsd_merge(gsd_field *field, const gsd_field *source)
+{
+    uint32_t i, k;
+    if (field->structure != source->structure || field->block->cells != source->block->cells ||
+        field->building_nodes != source->building_nodes || field->passes != source->passes ||
+        gsdi_pass_target(&field->desc, field->passes) != gsdi_pass_target(&source->desc, source->passes))
+        return GSD_MISMATCH;
+    for (i = 0; i < field->building_nodes; ++i)
+        field->sum[i] += source->sum[i];
+    for (i = 0; i < field->block->cells; ++i) {
+        gsdi_state *s = &field->states[i];
+        const gsdi_state *o = &source->states[i];
+        double both = s->fresh + o->fresh, share = both > 0 ? o->fresh / both : 0;
+        s->held += o->held;
+        s->fresh += o->fresh;
+        s->gate_count += o->gate_count;
+        s->theta += (float)(share * ((double)o->theta - (double)s->theta));
+        for (k = 0; k <= GSDI_GATE_LOW; ++k) {
+            s->v[k] += o->v[k];
+            s->vv[k] += o->vv[k];
+            if (k < GSDI_GATE_LOW)
+                s->cross[k] += o->cross[k];
+        }
+        for (k = 0; k < 64; ++k)
+            s->bins[k] = s->bins[k] <= 0xffffffffu - o->bins[k] ? s->bins[k] + o->bins[k] : 0xffffffffu;
+    }
+    field->stats.samples += source->stats.samples;
+    field->stats.zeros += source->stats.zeros;
+    field->stats.rejected += source->stats.rejected;
+    field->stats.refused += source->stats.refused;
+    field->stats.clamped += source->stats.clamped;
+    field->stats.lost += source->stats.lost;
+    return GSD_OK;
+}
+
+static uint32_t gsdi_inner_nodes(const gsd_field *field, gsd_part part, uint32_t cell)
+{
+    uint32_t groups = part == GSD_PART_SAMPLING ? gsdi_trees(field->block)[gsdi_cells(field->block)[cell].tree].groups
+                                                : (field->states[cell].count - 1) / 4;
+    return groups ? groups : 1;
+}
+
+GSD_API uint32_t gsd_export_bound(const gsd_field *field, gsd_part part, uint32_t cell)
+{
+    return cell < field->block->cells ? gsdi_inner_nodes(field, part, cell) : 0;
+}
+
+/* Values of inner nodes from their children, which come later. */
+static void gsdi_sum_up(gsd_tree *tree)
+{
+    uint32_t i, k;
+    for (i = tree->count; i-- > 0;)
+        for (k = 0; k < 4; ++k) {
+            uint32_t c = tree->child[i * 4 + k];
+            const float *v = tree->value + (size_t)c * 4;
+            if (c)
+                tree->value[i * 4 + k] = (v[0] + v[1]) + (v[2] + v[3]);
+        }
+}
+
+static void gsdi_export_sampling(const gsd_field *field, const gsdi_tree *from, gsd_tree *tree)
+{
+    const gsd_node *nodes = gsdi_nodes(field->block) + from->first;
+    double e = (double)field->block->uniform;
+    uint32_t i;
+    for (i = 0; i < from->groups * 4; ++i) {
+        double area = 12.566370614359172 * pow(0.25, (double)(nodes[i].leaf.x >> 24)), learned;
+        bool leaf = nodes[i].leaf.child == 0;
+        learned = leaf ? ((double)nodes[i].leaf.pdf - e * 0.07957747154594766788) / (1 - e) * area : 0;
+        tree->child[i] = leaf ? 0 : (nodes[i].inner.child - from->first) / 4;
+        tree->value[i] = (float)(learned > 0 ? learned : 0);
+    }
+}
+
+static void gsdi_export_building(const gsd_field *field, const gsdi_state *s, gsd_tree *tree)
+{
+    struct gsdi_down {
+        uint32_t inner, depth;
+    } stack[GSDI_STACK], v;
+    const uint32_t *child = field->child + s->first;
+    const double *sum = field->sum + s->first;
+    bool second_moment = gsdi_pass_target(&field->desc, field->passes) != GSD_TARGET_RADIANCE;
+    uint32_t top = 0, k;
+    stack[top].inner = stack[top].depth = 0;
+    ++top;
+    while (top) { /* inner node g owns nodes 1 + 4 g .. 4 + 4 g */
+        v = stack[--top];
+        for (k = 0; k < 4; ++k) {
+            uint32_t node = 1 + v.inner * 4 + k, c = child[node];
+            double own = second_moment ? sqrt(sum[node]) / (double)(1u << (v.depth + 1)) : sum[node];
+            tree->child[v.inner * 4 + k] = c ? (c - 1) / 4 : 0;
+            tree->value[v.inner * 4 + k] = (float)(c ? 0 : own < 3e38 ? own : 3e38);
+            if (c) {
+                stack[top].inner = (c - 1) / 4;
+                stack[top++].depth = v.depth + 1;
+            }
+        }
+    }
+}
+
+GSD_API gsd_result gsd_export_tree(const gsd_field *field, gsd_part part, gsd_tree *tree)
+{
+    uint32_t count, k;
+    if (tree->cell >= field->block->cells)
+        return GSD_BAD_CELL;
+    count = gsdi_inner_nodes(field, part, tree->cell);
+    if (tree->count < count)
+        return GSD_BUFFER_TOO_SMALL;
+    tree->count = count;
+    for (k = 0; k < 4; ++k) { /* what a single leaf gives */
+        tree->child[k] = 0;
+        tree->value[k] = part == GSD_PART_SAMPLING ? 0.25f : (float)(field->sum[field->states[tree->cell].first] / 4);
+    }
+    if (part == GSD_PART_SAMPLING)
+        gsdi_export_sampling(field, &gsdi_trees(field->block)[gsdi_cells(field->block)[tree->cell].tree], tree);
+    else if (field->states[tree->cell].count > 1)
+        gsdi_export_building(field, &field->states[tree->cell], tree);
+    gsdi_sum_up(tree);
+    return GSD_OK;
+}
+
+/* A plain tree to building form: child, mass of 1 + 4 count nodes. Total mass, or -1 where it is not a tree. */
+static double gsdi_import_convert(const gsd_tree *tree, uint32_t max_depth, uint32_t *child, double *mass,
+                                  unsigned char *depth)
+{
+    uint32_t i, k, reached = 1;
+    memset(depth, 0, tree->count);
+    child[0] = 1;
+    for (i = 0; i < tree->count; ++i)
+        for (k = 0; k < 4; ++k) {
+            uint32_t c = tree->child[i * 4 + k];
+            float v = tree->value[i * 4 + k];
+            if (c == 0) {
+                if (!(v >= 0 && v < 1e30f))
+                    return -1;
+            } else if (c <= i || c >= tree->count || depth[c] || depth[i] + 2u > max_depth) {
+                return -1;
+            } else {
+                depth[c] = (unsigned char)(depth[i] + 1);
+                ++reached;
+            }
+            child[1 + i * 4 + k] = c ? 1 + 4 * c : 0;
+            mass[1 + i * 4 + k] = c ? 0 : (double)v;
+        }
+    for (i = 4 * tree->count + 1; i-- > 0;) {
+        uint32_t c = child[i];
+        if (c)
+            mass[i] = (mass[c] + mass[c + 1]) + (mass[c + 2] + mass[c + 3]);
+    }
+    return reached == tree->count ? mass[0] : -1;
+}
+
+/* Sizes and addresses of the new block of an import. */
+static gsd_result gsdi_import_plan(gsdi_refinement *r, const gsd_tree *trees, uint32_t count, uint32_t *largest)
+{
+    gsdi_block shape = *r->field->block;
+    uint32_t i;
+    r->jobs = (gsdi_job *)gsdi_allocate(r->desc, shape.cells, sizeof *r->jobs);
+    if (!r->jobs)
+        return GSD_OUT_OF_MEMORY;
+    for (i = 0; i < count; ++i) {
+        if (trees[i].cell >= shape.cells)
+            return GSD_BAD_CELL;
+        if (trees[i].count == 0 || trees[i].count > 0x0fffffffu || r->jobs[trees[i].cell].rebuild)
+            return GSD_BAD_TREE;
+        r->jobs[trees[i].cell].rebuild = 1 + i;
+        r->jobs[trees[i].cell].groups = trees[i].count;
+        *largest = trees[i].count > *largest ? trees[i].count : *largest;
+    }
+    r->child = (uint32_t *)gsdi_allocate(r->desc, (uint64_t)*largest * 4 + 1, sizeof(uint32_t));
+    r->mass = (double *)gsdi_allocate(r->desc, (uint64_t)*largest * 4 + 1, sizeof(double));
+    r->depth = (unsigned char *)gsdi_allocate(r->desc, *largest, 1);
+    if (!r->child || !r->mass || !r->depth)
+        return GSD_OUT_OF_MEMORY;
+    for (i = 0; i < count; ++i) {
+        double total = gsdi_import_convert(&trees[i], r->desc->max_depth, r->child, r->mass, r->depth);
+        if (total < 0)
+            return GSD_BAD_TREE;
+        if (!(total > 0)) /* uniform */
+            r->jobs[trees[i].cell].groups = 0;
+    }
+    if (!gsdi_list_trees(r, &shape))
+        return GSD_OUT_OF_MEMORY;
+    shape.cell_capacity = shape.cells;
+    r->block = gsdi_block_allocate(r->desc, &shape, &r->memory);
+    return r->block ? GSD_OK : GSD_OUT_OF_MEMORY;
+}
+
+GSD_API gsd_result gsd_import_trees(gsd_field *field, const gsd_tree *trees, uint32_t count)
+{
+    gsdi_refinement r;
+    gsdi_block *old = field->block;
+    uint32_t i, largest = 1;
+    gsd_result result;
+    memset(&r, 0, sizeof r);
+    r.field = field;
+    r.desc = &field->desc;
+    result = gsdi_import_plan(&r, trees, count, &largest);
+    if (result) {
+        gsdi_refinement_free(&r);
+        return result;
+    }
+    gsdi_block_uniform(r.block);
+    memcpy(gsdi_words(r.block, r.block->spatial_at), gsdi_words(old, old->spatial_at), old->spatial * sizeof(uint32_t));
+    gsdi_block_grid(r.block);
+    for (i = 0; i < old->cells; ++i) {
+        const gsdi_job *job = &r.jobs[i];
+        gsdi_tree *tree = &r.trees[job->tree];
+        if (job->rebuild) {
+            gsdi_import_convert(&trees[job->rebuild - 1], r.desc->max_depth, r.child, r.mass, r.depth);
+            gsdi_tree_write(r.block, tree, r.child, r.mass);
+        } else if (job->copy) {
+            gsdi_tree_copy(r.block, tree, old, &gsdi_trees(old)[gsdi_cells(old)[i].tree]);
+        }
+        gsdi_cell_write(r.block, r.trees, &gsdi_cells(r.block)[i], &field->states[i], job->tree);
+    }
+    memcpy((char *)r.block + r.block->trees_at, r.trees, r.tree_count * sizeof(gsdi_tree));
+    gsdi_release(r.desc, field->memory);
+    field->memory = r.memory;
+    field->block = r.block;
+    r.memory = NULL;
+    gsdi_refinement_free(&r);
+    field->guiding = 0;
+    for (i = 0; i < field->block->cells; ++i)
+        field->guiding += gsdi_cells(field->block)[i].alpha < 1;
+    return GSD_OK;
+}
+
+#endif /* GSD_IMPLEMENTATION */
+
+/* ---- >>licence
+
+   This file is available under two licences; choose either.
+
+   MIT licence. Copyright (c) 2026 guide authors
+
+   Permission is hereby granted, free of charge, to any person obtaining a copy of this software and associated
+   documentation files (the "Software"), to deal in the Software without restriction, including without limitation the
+   rights to use, copy, modify, merge, publish, distribute, sublicense, and/or sell copies of the Software, and to permit
+   persons to whom the Software is furnished to do so, subject to the following conditions: the above copyright notice
+   and this permission notice shall be included in all copies or substantial portions of the Software.
+
+   THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR IMPLIED, INCLUDING BUT NOT LIMITED TO THE
+   WARRANTIES OF MERCHANTABILITY, FITNESS FOR A PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE AUTHORS OR
+   COPYRIGHT HOLDERS BE LIABLE FOR ANY CLAIM, DAMAGES OR OTHER LIABILITY, WHETHER IN AN ACTION OF CONTRACT, TORT OR
+   OTHERWISE, ARISING FROM, OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE SOFTWARE.
+
+   Unlicense (public domain, www.unlicense.org). This is free and unencumbered software released into the public domain.
+   Anyone is free to copy, modify, publish, use, compile, sell, or distribute this software, either in source code form
+   or as a compiled binary, for any purpose, commercial or non-commercial, and by any means. In jurisdictions that
+   recognize copyright laws, the author or authors of this software dedicate any and all copyright interest in the
+   software to the public domain. THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND. */

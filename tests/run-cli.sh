@@ -1,0 +1,196 @@
+#!/usr/bin/env bash
+# The renderer's command line: what it refuses, what it says, what it writes. Speaks TAP.
+# Each case runs $BUILD/render on tiny scenes written here; exit 1 with a message is asked for, never a signal.
+export LC_ALL=C
+cd "$(dirname "$0")/.." || exit 1
+render=$PWD/${BUILD:-build}/render
+imgerr=$PWD/${BUILD:-build}/imgerr
+tmp=$(mktemp -d) || exit 1
+trap 'rm -rf "$tmp"' EXIT
+cd "$tmp" || exit 1
+count=0 bad=0
+
+report() { # report STATUS NAME: 0 = ok; shows the last command's output where it is not
+    count=$((count + 1))
+    if [ "$1" -eq 0 ]; then
+        echo "ok $count - $2"
+    else
+        bad=$((bad + 1))
+        echo "not ok $count - $2"
+        sed 's/^/# /' log | head -n 12
+        [ -n "${why-}" ] && echo "# $why"
+    fi
+    why=
+}
+# refuses NAME PATTERN ARGUMENTS...: exit status 1 and a message on stderr that matches PATTERN (extended, any case).
+refuses() {
+    local name=$1 pattern=$2 status
+    shift 2
+    "$render" "$@" >out 2>log
+    status=$?
+    if [ $status -ne 1 ]; then
+        why="exit status $status, wanted 1" && report 1 "$name"
+    else
+        grep -qiE -- "$pattern" log
+        status=$? why="no message matching: $pattern"
+        report $status "$name"
+    fi
+}
+# completes NAME ARGUMENTS...: exit status 0.
+completes() {
+    local name=$1 status
+    shift
+    "$render" "$@" >out 2>log
+    status=$? why="exit status $status, wanted 0"
+    [ $status -eq 0 ]
+    report $? "$name"
+}
+
+# scene FILE [BODY] [FILM]: a lit quad before the camera, with BODY added on line 3.
+scene() {
+    cat >"$1" <<XML
+<scene version="3.0.0">
+  <integrator type="path"><integer name="max_depth" value="4"/></integrator>
+  ${2-}
+  <sensor type="perspective"><float name="fov" value="50"/>
+    <transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="${3-32}"/><integer name="height" value="18"/></film></sensor>
+  <shape type="rectangle"><bsdf type="diffuse"/></shape>
+  <shape type="sphere"><point name="center" x="0" y="2" z="2"/><float name="radius" value="0.5"/>
+    <emitter type="area"><rgb name="radiance" value="4,4,4"/></emitter></shape>
+</scene>
+XML
+}
+scene good.xml
+quick="--spp 2 --quiet"
+
+# ---- options
+refuses 'no arguments: says how to get help' 'scene.*help|usage'
+refuses 'no scene' 'scene|usage' --method pt --spp 1
+refuses 'missing scene file names it' 'absent\.xml' absent.xml $quick
+refuses 'unknown option names it' 'frobnicate' good.xml --frobnicate $quick
+refuses 'option without its value' 'method' good.xml --method
+refuses 'unknown method names it' 'nosuch' good.xml --method nosuch $quick
+refuses 'unknown --set key names it' 'nokey' good.xml --method sdtree --set nokey=1 $quick
+refuses '--set on a method without options' 'nokey' good.xml --method pt --set nokey=1 $quick
+refuses '--set without =' 'set' good.xml --method sdtree --set nokey $quick
+refuses 'bad number: spp' 'spp' good.xml --spp ten --quiet
+refuses 'bad number: trailing text' 'spp' good.xml --spp 10x --quiet
+refuses 'bad number: zero spp' 'spp' good.xml --spp 0 --quiet
+refuses 'bad number: negative spp' 'spp' good.xml --spp -3 --quiet
+refuses 'bad number: too large' 'spp' good.xml --spp 99999999999999999999 --quiet
+refuses 'bad number: seconds' 'seconds' good.xml --seconds soon --quiet
+refuses 'bad number: seconds nan' 'seconds' good.xml --seconds nan --quiet
+refuses 'bad number: threads' 'threads' good.xml --threads two $quick
+refuses 'bad number: seed' 'seed' good.xml --seed x $quick
+refuses 'bad number: max depth' 'depth' good.xml --max-depth deep $quick
+refuses 'bad size: words' 'size' good.xml --size large $quick
+refuses 'bad size: one number' 'size' good.xml --size 32 $quick
+refuses 'bad size: 0x0' 'size' good.xml --size 0x0 $quick
+refuses 'bad size: too large' 'size|large|memory' good.xml --size 2000000000x2000000000 $quick
+refuses 'bad switch: nee' 'nee' good.xml --nee perhaps $quick
+refuses 'bad switch: roulette' 'rr' good.xml --rr perhaps $quick
+refuses 'spp and seconds together' 'spp|seconds' good.xml --spp 1 --seconds 1 --quiet
+refuses 'two scenes' 'good\.xml.*other\.xml' good.xml other.xml $quick
+completes '--help' --help
+grep -q -- '--method' out && grep -q -- '--seconds' out
+report $? '--help lists the options'
+
+# ---- scene files: error or warning with file and line
+printf '<scene version="3.0.0">\n  <shape type="sphere">\n</scene>\n' >broken.xml
+refuses 'broken XML: file and line' 'broken\.xml:3' broken.xml $quick
+: >empty.xml
+refuses 'empty file' 'empty\.xml' empty.xml $quick
+printf '<other/>\n' >other.xml
+refuses 'not a scene' 'other\.xml:1' other.xml $quick
+scene number.xml '<shape type="sphere"><float name="radius" value="wide"/></shape>'
+refuses 'bad number in a scene: file and line' 'number\.xml:3' number.xml $quick
+scene unknown.xml '<gizmo name="x" value="1"/>'
+completes 'unknown element: renders' unknown.xml $quick -o unknown.exr
+grep -qE 'unknown\.xml:3.*warning.*gizmo|warning.*unknown\.xml:3.*gizmo' log
+report $? 'unknown element: warning with file and line'
+scene plugin.xml '<shape type="blob"/>'
+completes 'unknown shape: renders' plugin.xml $quick
+grep -qE 'plugin\.xml:3.*blob' log
+report $? 'unknown shape: warning with file and line'
+scene mesh.xml '<shape type="ply"><string name="filename" value="absent.ply"/></shape>'
+"$render" mesh.xml $quick >out 2>log
+status=$? why="exit status $status"
+[ $status -le 1 ] && grep -qE 'mesh\.xml:3' log && grep -q 'absent\.ply' log
+report $? 'missing mesh: message with file and line'
+scene zero.xml '' 0
+"$render" zero.xml $quick >out 2>log
+status=$? why="exit status $status"
+[ $status -eq 1 ] && grep -qiE 'zero\.xml:6|zero\.xml.*(width|size)' log
+report $? 'film of 0 pixels: error with file'
+scene undefined.xml '<shape type="sphere"><float name="radius" value="$nothing"/></shape>'
+refuses 'undefined $variable: file and line' 'undefined\.xml:3.*nothing' undefined.xml $quick
+scene define.xml '<default name="r" value="0.1"/><shape type="sphere"><point name="center" x="0" y="0" z="1"/><float name="radius" value="$r"/><bsdf type="diffuse"/></shape>'
+completes '-D: renders' define.xml $quick -D r=0.9 -o define1.exr
+completes '-D: default' define.xml $quick -o define2.exr
+! cmp -s define1.exr define2.exr
+report $? '-D changes the picture'
+
+# ---- outputs
+completes 'writes an image' good.xml --spp 4 --quiet --threads 1 -o one.exr --png one.png --json one.json
+[ "$(head -c 4 one.exr | od -An -tx1 | tr -d ' ')" = 762f3101 ]
+report $? 'EXR begins with its magic number'
+[ "$(head -c 4 one.png | od -An -tx1 | tr -d ' ')" = 89504e47 ]
+report $? 'PNG begins with its magic number'
+cp one.json log 2>/dev/null
+for key in method spp cpu_seconds wall_seconds cells bytes samples; do
+    grep -q "^[[:space:]]*\"$key\"[[:space:]]*:" one.json
+    report $? "JSON has \"$key\", on a line of its own"
+done
+[ "$(grep -c '{' one.json)" -ge 1 ] && [ "$(tr -cd '{' <one.json | wc -c)" = "$(tr -cd '}' <one.json | wc -c)" ] &&
+    ! grep -qE '\b(nan|inf)\b' one.json
+report $? 'JSON: braces match, no nan or inf'
+completes '--reference: measures' good.xml --spp 4 --quiet --seed 7 --reference one.exr --json ref.json
+cp ref.json log 2>/dev/null
+grep -qE '"relmse"[[:space:]]*:[[:space:]]*[0-9]' ref.json && grep -qE '"mrae"[[:space:]]*:[[:space:]]*[0-9]' ref.json
+report $? 'JSON has relmse and mrae with a reference'
+completes '--reference larger than the picture' good.xml --spp 2 --quiet --size 16x9 --reference one.exr
+refuses '--reference of another shape' 'one\.exr|size' good.xml $quick --size 20x20 --reference one.exr
+refuses '--reference missing' 'absent\.exr' good.xml $quick --reference absent.exr
+printf 'not an image' >bad.exr
+refuses '--reference unreadable' 'bad\.exr' good.xml $quick --reference bad.exr
+refuses 'unwritable output names it' 'absent/x\.exr' good.xml $quick -o absent/x.exr
+refuses 'unwritable PNG names it' 'absent/x\.png' good.xml $quick --png absent/x.png
+refuses 'unwritable JSON names it' 'absent/x\.json' good.xml $quick --json absent/x.json
+
+# ---- the same picture for any number of threads
+for method in pt sdtree; do
+    for threads in 1 2 3; do
+        "$render" good.xml --method $method --spp 15 --size 80x45 --threads $threads --quiet -o $method$threads.exr >out 2>log ||
+            : >$method$threads.exr
+    done
+    [ -s ${method}1.exr ] && cmp ${method}1.exr ${method}2.exr >>log 2>&1 && cmp ${method}1.exr ${method}3.exr >>log 2>&1
+    report $? "$method: identical for 1, 2 and 3 threads"
+    rm -f seed.exr
+    "$render" good.xml --method $method --spp 15 --size 80x45 --seed 99 --quiet -o seed.exr >out 2>log
+    [ -s seed.exr ] && ! cmp -s ${method}1.exr seed.exr
+    report $? "$method: another seed, another picture"
+done
+completes '--quiet says nothing' good.xml $quick -o quiet.exr
+[ ! -s out ] && [ ! -s log ]
+report $? '--quiet leaves stdout and stderr empty'
+completes 'a budget in seconds ends' good.xml --method sdtree --seconds 0.5 --quiet -o seconds.exr
+
+# ---- imgerr
+"$imgerr" one.exr one.exr >out 2>log
+status=$?
+cp out log
+[ $status -eq 0 ] && grep -qiE 'relmse[^0-9]*0(\.0*)?([^.0-9]|$)' out
+report $? 'imgerr: an image has no error against itself'
+"$imgerr" one.exr absent.exr >out 2>log
+[ $? -eq 1 ] && grep -q 'absent\.exr' log
+report $? 'imgerr: missing file is named'
+"$imgerr" bad.exr one.exr >out 2>log
+[ $? -eq 1 ] && grep -q 'bad\.exr' log
+report $? 'imgerr: unreadable file is named'
+"$imgerr" >out 2>log
+[ $? -eq 1 ] && grep -qi usage log
+report $? 'imgerr: usage'
+
+echo "1..$count"
+[ "$bad" -eq 0 ]

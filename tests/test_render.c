@@ -1,0 +1,370 @@
+/* test_render.c: the integrator against the outside: analytic irradiance and furnaces, three estimators that must
+   agree, guided against unguided, and bit-identical images for any number of threads.
+
+     >>tools >>analytic >>agree >>guided >>identical >>misuse */
+#include "cmocka_prelude.h"
+#include "tracer.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+#define SCENES "examples/scenes/"
+
+/* ---- >>tools ------------------------------------------------------------------------------------------------ */
+
+static tr_scene *load(const char *name, const char *define, const char *value)
+{
+    char path[256];
+    tr_define d = {define, value};
+    tr_log log = {.out = stderr};
+    snprintf(path, sizeof path, SCENES "%s.xml", name);
+    tr_scene *scene = tr_scene_load(path, &d, define ? 1 : 0, 1, &log);
+    assert_non_null(scene);
+    assert_int_equal(log.errors, 0);
+    return scene;
+}
+
+static tr_settings small(const char *method, int spp)
+{
+    tr_settings s;
+    memset(&s, 0, sizeof s);
+    s.width = 80;
+    s.height = 48;
+    s.spp = spp;
+    s.max_depth = 6;
+    s.threads = 2;
+    s.method = tr_method_find(method);
+    assert_non_null(s.method);
+    return s;
+}
+
+static tr_result render(const tr_scene *scene, const tr_settings *settings)
+{
+    tr_result r;
+    char err[256] = "";
+    if (!tr_render(scene, settings, &r, err, sizeof err))
+        fail_msg("%s", err);
+    return r;
+}
+
+/* Largest |z| over 16x16 tiles and channels of the difference of two renders, and the z of the whole image. A tile's
+   variance gets a floor: 0.1 % of its value, so that float rounding is no difference. */
+static double worst_z(const tr_result *a, const tr_result *b, double *whole)
+{
+    int w = a->color.width, h = a->color.height;
+    double worst = 0, all_difference = 0, all_variance = 0;
+    for (int y0 = 0; y0 < h; y0 += 16)
+        for (int x0 = 0; x0 < w; x0 += 16)
+            for (int c = 0; c < 3; ++c) {
+                double difference = 0, variance = 0, value = 0;
+                for (int y = y0; y < y0 + 16 && y < h; ++y)
+                    for (int x = x0; x < x0 + 16 && x < w; ++x) {
+                        size_t i = 3 * ((size_t)y * (size_t)w + (size_t)x) + (size_t)c;
+                        difference += (double)a->color.data[i] - b->color.data[i];
+                        variance += (double)a->variance.data[i] + b->variance.data[i];
+                        value += a->color.data[i];
+                    }
+                all_difference += difference;
+                all_variance += variance;
+                double z = fabs(difference) / sqrt(variance + 1e-6 * value * value + 1e-20);
+                worst = z > worst ? z : worst;
+            }
+    *whole = fabs(all_difference) / sqrt(all_variance + 1e-20);
+    return worst;
+}
+
+/* 15 tiles x 3 channels: |z| < 4.6 is a family-wise error of 2e-4 for normal tiles; the images' tails are heavier
+   than normal, hence the small margin above the Bonferroni bound (4.1 at 2e-3). */
+#define Z_TILE 4.6
+#define Z_WHOLE 4.0
+
+static void assert_agree(const char *what, const tr_result *a, const tr_result *b)
+{
+    double whole, worst = worst_z(a, b, &whole);
+    if (worst > Z_TILE || whole > Z_WHOLE)
+        fail_msg("%s: images differ: worst tile z %.2f, whole image z %.2f", what, worst, whole);
+}
+
+/* ---- >>analytic --------------------------------------------------------------------------------------------- */
+
+/* A white diffuse floor at y = 0 looked at from straight above through a narrow lens. */
+static tr_scene *floor_scene(void)
+{
+    tr_scene *s = tr_scene_new();
+    assert_non_null(s);
+    int b = tr_scene_add_bsdf(s, TR_BSDF_DIFFUSE), shape = tr_scene_add_shape(s);
+    assert_true(b >= 0 && shape >= 0);
+    s->bsdfs[b].reflectance.value = v3s(1);
+    tr_shape *f = &s->shapes[shape];
+    f->type = TR_SHAPE_MESH;
+    f->bsdf = b;
+    f->light = -1;
+    f->vertex_count = 3;
+    f->triangle_count = 1;
+    f->positions = calloc(12, sizeof(float));
+    f->indices = calloc(3, sizeof(uint32_t));
+    assert_true(f->positions && f->indices);
+    const float p[9] = {-10, 0, -10, 0, 0, 20, 10, 0, -10};
+    memcpy(f->positions, p, sizeof p);
+    f->indices[1] = 1;
+    f->indices[2] = 2;
+    memset(&s->camera, 0, sizeof s->camera);
+    /* columns: left = +x, up = +z, forward = -y */
+    s->camera.to_world = (mat4){{{1, 0, 0, 0}, {0, 0, -1, 0.5f}, {0, 1, 0, 0}, {0, 0, 0, 1}}};
+    s->camera.fov = 0.02f;
+    s->width = s->height = 16;
+    s->max_depth = 2;
+    return s;
+}
+
+static void add_black(tr_shape *f, tr_scene *s, int shape, vec3 radiance)
+{
+    int b = tr_scene_add_bsdf(s, TR_BSDF_DIFFUSE), l = tr_scene_add_light(s, TR_LIGHT_AREA);
+    assert_true(b >= 0 && l >= 0);
+    s->bsdfs[b].reflectance.value = v3s(0);
+    s->lights[l].shape = shape;
+    s->lights[l].value = radiance;
+    f->bsdf = b;
+    f->light = l;
+}
+
+/* Mean radiance of the floor under `scene`, times pi = irradiance. */
+static double floor_irradiance(tr_scene *scene, bool nee, double *sigma)
+{
+    tr_log log = {.out = stderr};
+    assert_true(tr_scene_finish(scene, 1, &log));
+    tr_settings s = small("pt", 256);
+    s.width = s.height = 16;
+    s.max_depth = 2;
+    s.no_nee = !nee;
+    tr_result r = render(scene, &s);
+    double sum = 0, variance = 0;
+    for (int i = 0; i < 16 * 16; ++i) {
+        sum += r.color.data[3 * i];
+        variance += r.variance.data[3 * i];
+    }
+    *sigma = TR_PI * sqrt(variance) / 256;
+    tr_result_free(&r);
+    tr_scene_free(scene);
+    return TR_PI * sum / 256;
+}
+
+static void check_irradiance(tr_scene *(*make)(void), double expected)
+{
+    for (int nee = 0; nee < 2; ++nee) {
+        double sigma, e = floor_irradiance(make(), nee, &sigma);
+        if (fabs(e - expected) > 4.5 * sigma + 2e-4 * expected)
+            fail_msg("irradiance with nee %d: %g +- %g, expected %g", nee, e, sigma, expected);
+    }
+}
+
+/* The camera sits at y = 0.5 below these lights, which lie at y = 2. */
+static tr_scene *disk_over_floor(void)
+{
+    tr_scene *s = floor_scene();
+    int shape = tr_scene_add_shape(s);
+    tr_shape *d = &s->shapes[shape];
+    d->type = TR_SHAPE_DISK;
+    /* local z -> -y, radius 1.5, at y = 2 */
+    d->object_to_world = (mat4){{{1.5f, 0, 0, 0}, {0, 0, -1, 2}, {0, 1.5f, 0, 0}, {0, 0, 0, 1}}};
+    d->world_to_object = (mat4){{{1 / 1.5f, 0, 0, 0}, {0, 0, 1 / 1.5f, 0}, {0, -1, 0, 2}, {0, 0, 0, 1}}};
+    add_black(d, s, shape, v3s(3));
+    return s;
+}
+
+static tr_scene *sphere_over_floor(void)
+{
+    tr_scene *s = floor_scene();
+    int shape = tr_scene_add_shape(s);
+    tr_shape *d = &s->shapes[shape];
+    d->type = TR_SHAPE_SPHERE;
+    d->center = v3(0, 2, 0);
+    d->radius = 0.7f;
+    d->object_to_world = (mat4){{{0.7f, 0, 0, 0}, {0, 0.7f, 0, 2}, {0, 0, 0.7f, 0}, {0, 0, 0, 1}}};
+    d->world_to_object = (mat4){{{1 / 0.7f, 0, 0, 0}, {0, 1 / 0.7f, 0, -2 / 0.7f}, {0, 0, 1 / 0.7f, 0}, {0, 0, 0, 1}}};
+    add_black(d, s, shape, v3s(3));
+    return s;
+}
+
+static tr_scene *rectangle_over_floor(void)
+{
+    tr_scene *s = floor_scene();
+    int shape = tr_scene_add_shape(s);
+    tr_shape *d = &s->shapes[shape];
+    d->type = TR_SHAPE_MESH;
+    d->vertex_count = 4;
+    d->triangle_count = 2;
+    d->positions = calloc(15, sizeof(float));
+    d->indices = calloc(6, sizeof(uint32_t));
+    assert_true(d->positions && d->indices);
+    const float p[12] = {-1, 2, -2, 1, 2, -2, 1, 2, 2, -1, 2, 2};
+    const uint32_t t[6] = {0, 1, 2, 0, 2, 3}; /* normal down */
+    memcpy(d->positions, p, sizeof p);
+    memcpy(d->indices, t, sizeof t);
+    add_black(d, s, shape, v3s(3));
+    return s;
+}
+
+static void irradiance_under_a_disk(void **state)
+{
+    (void)state;
+    check_irradiance(disk_over_floor, TR_PI * 3 * 1.5 * 1.5 / (1.5 * 1.5 + 2 * 2));
+}
+
+static void irradiance_under_a_sphere(void **state)
+{
+    (void)state;
+    check_irradiance(sphere_over_floor, TR_PI * 3 * 0.7 * 0.7 / (2 * 2));
+}
+
+static void irradiance_under_a_rectangle(void **state)
+{
+    (void)state;
+    /* Four corner configurations a x b at height c: E/L = 2 * (a/sqrt(a^2+c^2) atan(b/sqrt(a^2+c^2)) + ...). */
+    double a = 1, b = 2, c = 2, p = sqrt(a * a + c * c), q = sqrt(b * b + c * c);
+    check_irradiance(rectangle_over_floor, 3 * 4 * 0.5 * (a / p * atan(b / p) + b / q * atan(a / q)));
+}
+
+/* A closed white furnace: radiance 1 from everywhere, albedo-1 floor: every pixel is exactly 1 in expectation. */
+static void furnace_is_white(void **state)
+{
+    (void)state;
+    tr_scene *s = floor_scene();
+    int l = tr_scene_add_light(s, TR_LIGHT_CONSTANT);
+    s->lights[l].value = v3s(1);
+    double sigma, e = floor_irradiance(s, true, &sigma);
+    assert_true(fabs(e / TR_PI - 1) < 4.5 * sigma / TR_PI + 1e-4);
+}
+
+/* ---- >>agree ------------------------------------------------------------------------------------------------ */
+
+/* BSDF sampling alone, NEE alone and both by MIS estimate the same image. */
+static void estimators_agree(const char *scene_name, const char *define, const char *value, int spp)
+{
+    tr_scene *scene = load(scene_name, define, value);
+    tr_settings s = small("pt", spp);
+    tr_result mis = render(scene, &s);
+    s.no_bsdf_hits = true;
+    s.seed = 1;
+    tr_result nee = render(scene, &s);
+    s.no_bsdf_hits = false;
+    s.no_nee = true;
+    s.seed = 2;
+    s.spp = 4 * spp;
+    tr_result bsdf = render(scene, &s);
+    assert_agree("MIS and NEE only", &mis, &nee);
+    assert_agree("MIS and BSDF only", &mis, &bsdf);
+    tr_result_free(&mis);
+    tr_result_free(&nee);
+    tr_result_free(&bsdf);
+    tr_scene_free(scene);
+}
+
+static void estimators_agree_on_cornell(void **state) { (void)state, estimators_agree("cornell", NULL, NULL, 64); }
+static void estimators_agree_on_hall(void **state) { (void)state, estimators_agree("hall", NULL, NULL, 64); }
+static void estimators_agree_on_gloss(void **state) { (void)state, estimators_agree("gloss", NULL, NULL, 128); }
+
+/* ---- >>guided ----------------------------------------------------------------------------------------------- */
+
+static void guided_agrees(const char *scene_name, const char *define, const char *value, int spp, bool nee)
+{
+    tr_scene *scene = load(scene_name, define, value);
+    tr_settings s = small("pt", spp);
+    s.no_nee = !nee;
+    tr_result pt = render(scene, &s);
+    s.method = tr_method_find("sdtree");
+    s.seed = 1;
+    tr_result guided = render(scene, &s);
+    assert_agree("pt and sdtree", &pt, &guided);
+    tr_result_free(&pt);
+    tr_result_free(&guided);
+    tr_scene_free(scene);
+}
+
+static void guided_agrees_on_cornell(void **state) { (void)state, guided_agrees("cornell", NULL, NULL, 127, false); }
+static void guided_agrees_on_gloss(void **state) { (void)state, guided_agrees("gloss", NULL, NULL, 127, true); }
+
+/* ---- >>identical -------------------------------------------------------------------------------------------- */
+
+static void same_for_threads(const char *method)
+{
+    tr_scene *scene = load("ajar", NULL, NULL);
+    tr_settings s = small(method, 15);
+    s.threads = 1;
+    tr_result one = render(scene, &s);
+    for (int threads = 2; threads <= 5; threads += 3) {
+        s.threads = threads;
+        tr_result many = render(scene, &s);
+        assert_memory_equal(one.color.data, many.color.data, sizeof(float) * 80 * 48 * 3);
+        assert_memory_equal(one.variance.data, many.variance.data, sizeof(float) * 80 * 48 * 3);
+        assert_memory_equal(one.alpha.data, many.alpha.data, sizeof(float) * 80 * 48);
+        tr_result_free(&many);
+    }
+    s.seed = 7;
+    tr_result other = render(scene, &s);
+    assert_memory_not_equal(one.color.data, other.color.data, sizeof(float) * 80 * 48 * 3);
+    tr_result_free(&other);
+    tr_result_free(&one);
+    tr_scene_free(scene);
+}
+
+static void pt_is_identical_for_any_threads(void **state) { (void)state, same_for_threads("pt"); }
+static void sdtree_is_identical_for_any_threads(void **state) { (void)state, same_for_threads("sdtree"); }
+
+/* With every gate closed the guided render is the unguided one. */
+static void closed_gate_changes_no_bit(void **state)
+{
+    (void)state;
+    tr_scene *scene = load("cornell", NULL, NULL);
+    tr_settings s = small("pt", 31);
+    tr_result pt = render(scene, &s);
+    tr_option off = {"guide", "off", false};
+    s.method = tr_method_find("sdtree");
+    s.options = &off;
+    s.option_count = 1;
+    tr_result closed = render(scene, &s);
+    assert_memory_equal(pt.color.data, closed.color.data, sizeof(float) * 80 * 48 * 3);
+    tr_result_free(&pt);
+    tr_result_free(&closed);
+    tr_scene_free(scene);
+}
+
+/* ---- >>misuse ----------------------------------------------------------------------------------------------- */
+
+static void refuses_a_missing_budget_and_unknown_options(void **state)
+{
+    (void)state;
+    tr_scene *scene = load("cornell", NULL, NULL);
+    tr_settings s = small("pt", 0);
+    tr_result r;
+    char err[256] = "";
+    assert_false(tr_render(scene, &s, &r, err, sizeof err));
+    assert_non_null(strstr(err, "budget"));
+    tr_option odd = {"colour", "blue", false};
+    s.spp = 1;
+    s.options = &odd;
+    s.option_count = 1;
+    assert_false(tr_render(scene, &s, &r, err, sizeof err));
+    assert_non_null(strstr(err, "colour"));
+    tr_scene_free(scene);
+}
+
+int main(void)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(irradiance_under_a_disk),
+        cmocka_unit_test(irradiance_under_a_sphere),
+        cmocka_unit_test(irradiance_under_a_rectangle),
+        cmocka_unit_test(furnace_is_white),
+        cmocka_unit_test(estimators_agree_on_cornell),
+        cmocka_unit_test(estimators_agree_on_hall),
+        cmocka_unit_test(estimators_agree_on_gloss),
+        cmocka_unit_test(guided_agrees_on_cornell),
+        cmocka_unit_test(guided_agrees_on_gloss),
+        cmocka_unit_test(pt_is_identical_for_any_threads),
+        cmocka_unit_test(sdtree_is_identical_for_any_threads),
+        cmocka_unit_test(closed_gate_changes_no_bit),
+        cmocka_unit_test(refuses_a_missing_budget_and_unknown_options),
+    };
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}
