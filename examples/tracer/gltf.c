@@ -526,6 +526,18 @@ static void read_scene(gltf *g)
     }
 }
 
+static const struct aiScene *import(const char *path)
+{
+    return aiImportFile(path, aiProcess_ValidateDataStructure | aiProcess_Triangulate | aiProcess_TransformUVCoords);
+}
+
+static void try_import(void *path)
+{
+    const struct aiScene *ai = import(path);
+    if (ai)
+        aiReleaseImport(ai);
+}
+
 bool tr_gltf_load(tr_scene *scene, const char *path, tr_log *log)
 {
     gltf g = {0};
@@ -539,12 +551,16 @@ bool tr_gltf_load(tr_scene *scene, const char *path, tr_log *log)
     g.path = path;
     g.scene = scene;
     g.log = log;
-    g.ai = aiImportFile(path, aiProcess_ValidateDataStructure | aiProcess_Triangulate | aiProcess_TransformUVCoords);
+    bool survives = tr_survives(try_import, scene->path);
+    g.ai = survives ? import(path) : NULL;
     if (g.ai && g.ai->mNumMeshes) {
         g.json = json_text(data, size);
         read_scene(&g);
     } else {
-        tr_message(log, TR_ERROR, path, 0, "not a usable glTF file: %.200s", g.ai ? "no meshes" : aiGetErrorString());
+        tr_message(log, TR_ERROR, path, 0, "not a usable glTF file: %.200s",
+                   !survives ? "it crashes its importer"
+                   : g.ai    ? "no meshes"
+                             : aiGetErrorString());
         g.failed = true;
     }
     if (g.ai)

@@ -146,11 +146,11 @@ fail(char *err, size_t err_size, const char *format, ...)
 
 unsigned char *tr_file_read(const char *path, size_t *size, char *err, size_t err_size)
 {
-    FILE *f = fopen(path, "rb");
     unsigned char *data = NULL;
     long length = -1;
     *size = 0;
     errno = 0;
+    FILE *f = fopen(path, "rb");
     if (f && fseek(f, 0, SEEK_END) == 0 && (length = ftell(f)) >= 0 && length < LONG_MAX - 1 &&
         fseek(f, 0, SEEK_SET) == 0)
         data = malloc((size_t)length + 1);
@@ -191,14 +191,34 @@ static void copy_ai_mesh(tr_shape *s, const struct aiMesh *m, uint32_t *vertex, 
     *vertex += m->mNumVertices;
 }
 
+typedef struct obj_source {
+    const unsigned char *data;
+    unsigned size;
+} obj_source;
+
+static const struct aiScene *import_obj(const obj_source *source)
+{
+    return aiImportFileFromMemory(
+        (const char *)source->data, source->size,
+        aiProcess_ValidateDataStructure | aiProcess_Triangulate | aiProcess_JoinIdenticalVertices, "obj");
+}
+
+static void try_obj(void *context)
+{
+    const struct aiScene *ai = import_obj(context);
+    if (ai)
+        aiReleaseImport(ai);
+}
+
 /* All groups become one shape. Material files are not read: the scene's bsdfs count. */
 static bool read_obj(tr_shape *s, const unsigned char *data, size_t size, char *err, size_t err_size)
 {
+    obj_source source = {data, (unsigned)size};
     if (size > UINT32_MAX)
         return fail(err, err_size, "the OBJ file is larger than 4 GiB");
-    const struct aiScene *ai = aiImportFileFromMemory(
-        (const char *)data, (unsigned)size,
-        aiProcess_ValidateDataStructure | aiProcess_Triangulate | aiProcess_JoinIdenticalVertices, "obj");
+    if (!tr_survives(try_obj, &source))
+        return fail(err, err_size, "the OBJ file is broken in a way that crashes its importer");
+    const struct aiScene *ai = import_obj(&source);
     if (!ai)
         return fail(err, err_size, "not a valid OBJ file: %.150s", aiGetErrorString());
     uint64_t vertices = 0, triangles = 0;

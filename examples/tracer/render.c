@@ -34,7 +34,7 @@ static const char usage_text[] = "usage: render SCENE.xml|SCENE.gltf|SCENE.glb [
                                  "  --size WxH            picture size (default: the scene's)\n"
                                  "  --max-depth D         path edges, 1 = emitted light only (default: the scene's)\n"
                                  "  --nee on|off          next event estimation (default on)\n"
-                                 "  --rr on|off           Russian roulette from the 5th edge on (default on)\n"
+                                 "  --rr on|off           Russian roulette on the albedo from the 5th edge on (default off)\n"
                                  "  --seed N, --threads N\n"
                                  "  -D name=value         value for $name in the scene file (repeatable)\n"
                                  "  --reference R.exr     print errors against R; R may be larger by a whole factor\n"
@@ -153,7 +153,6 @@ static int parse(options *o, int argc, char **argv)
 {
     o->method = "pt";
     o->settings.options = o->set;
-    o->settings.roulette = TR_ROULETTE_THROUGHPUT;
     for (int i = 1; i < argc; ++i) {
         bool known = true;
         if (!strcmp(argv[i], "--quiet")) {

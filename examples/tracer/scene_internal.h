@@ -104,6 +104,8 @@ typedef struct tr_mesh_options {
 /* Read a file into an empty shape; on failure a one-line reason goes to err. Safe against broken files. */
 bool tr_mesh_load(tr_shape *shape, const char *path, const tr_mesh_options *options, char *err, size_t err_size);
 bool tr_ply_read(tr_shape *shape, const unsigned char *data, size_t size, char *err, size_t err_size);
+/* Run call(context) in a child process; false = it crashed or took minutes there. */
+bool tr_survives(void (*call)(void *), void *context);
 /* The whole file in memory with a 0 byte after it, NULL = could not read (reason in err). */
 unsigned char *tr_file_read(const char *path, size_t *size, char *err, size_t err_size);
 

@@ -278,7 +278,7 @@ static void include(reader *r, xnode *node)
     free(path);
     ++r->tree->includes;
     if (kept && !parse_file(r->tree, kept, r->at))
-        stop(r, "the included file could not be read:", name);
+        stop(r, "the included file cannot be read:", name);
     --r->tree->includes;
 }
 
@@ -381,6 +381,8 @@ static bool parse_file(xtree *t, const char *path, xnode *into)
     size_t size;
     unsigned char *data = tr_file_read(path, &size, err, sizeof err);
     if (!data) {
+        if (into)
+            return false; /* the includer knows the line */
         tr_message(t->log, TR_ERROR, path, 0, "%s", err);
         t->failed = true;
         return false;
