@@ -61,10 +61,13 @@
      Selection probability: handle.alpha is the probability to sample the BSDF; 1 means: do not guide here. The caller
      draws from the BSDF with alpha, else from gsd_sample, and divides by alpha pdf_bsdf + (1 - alpha) gsd_pdf.
 
-     Gate: guiding is used in a cell until its own samples show that it does not pay, V(1) / V(a) - 1 < gate_margin
-     where V(a) = mean of contribution^2 / (p p_a), p_a = a pdf_bsdf + (1 - a) pdf_guide. Samples of a pass judge the
-     tree built from earlier passes. A verdict needs 95 % confidence and many non-zero samples; closed cells are tried
-     again every gate_probe passes and need more to open than to close. Cells without a verdict guide.
+     Gate: guiding is used in a cell until its own samples show that it does not pay. V(a) = mean of contribution^2 /
+     (p p_a), p_a = a pdf_bsdf + (1 - a) pdf_guide, is the second moment with selection probability a; m = mean of
+     contribution / p. Guiding pays where V(1) > (1 + gate_margin) V(a) + gate_gain m^2: it must save a share of the
+     second moment, and enough noise to be worth its time. Samples of a pass judge the tree built from earlier passes.
+     Since V(a) >= m^2 for the best of guides, a cell with V(1) < (1 + gate_gain) m^2 closes without waiting for a
+     tree. Verdicts need 95 % confidence and many non-zero samples: cells whose light is rarely found stay open. Closed
+     cells are tried again every gate_probe passes and need more to open than to close. Cells without verdict guide.
 
    THE SAMPLE
      One per non-delta path vertex whose direction was traced. radiance L: from that direction, no cosine, no BSDF, not
@@ -196,7 +199,7 @@ typedef struct gsd_desc {
     float bounds_min[3], bounds_max[3]; /* world-space box of the positions; made a cube and 0.1 % larger */
     gsd_target target;
     uint32_t switch_pass;  /* switching: first variance-aware pass, 1 .. 1000; default 4 (passes 0..3 have 15 spp) */
-    float split_samples;   /* c, samples a cell holds before it splits, 16 .. 1e9; default 4000 */
+    float split_samples;   /* c, samples a cell holds before it splits, 16 .. 1e9; default 1000 */
     float rho;             /* share of a quadtree's mass above which a node is divided, 1e-5 .. 1; default 0.01 */
     uint32_t max_depth;    /* of quadtrees, 1 .. 20; default 16 */
     uint32_t max_levels;   /* of the spatial tree (3 levels halve all axes), 1 .. 60; default 48 */
@@ -212,7 +215,8 @@ typedef struct gsd_desc {
     bool no_history;        /* clear the sums in every refine. Otherwise a cell whose pass brought less than 1.5 times
                                the samples it held keeps half of its sums: passes of equal size then add up */
     bool alias;             /* build alias tables: sampling in constant time, but not monotone in u; + 12 bytes a leaf */
-    float gate_margin;      /* gain V(1)/V(a) - 1 below which guiding does not pay, 0.001 .. 10; default 0.15 */
+    float gate_margin;      /* V(1) / V(a) - 1 below which guiding does not pay, 0.001 .. 10; default 0.05 */
+    float gate_gain;        /* (V(1) - V(a)) / m^2 below which guiding does not pay, 0.001 .. 1000; default 4 */
     uint32_t gate_probe;    /* passes between tries of a closed cell, 1 .. 1000; default 1 */
     uint32_t forest_cells;  /* > 0: no spatial tree; that many cells, which the caller addresses by index */
     gsd_simd simd;          /* pin the level of the batch queries; default: the best that this machine has */
@@ -436,22 +440,17 @@ GSD_QUERY void gsd_coordinates(const float direction[3], uint32_t *x, uint32_t *
     float dx = direction[0], dy = direction[1], z = direction[2];
     float ax = fabsf(dx), ay = fabsf(dy);
     float big = ax > ay ? ax : ay, small = ax > ay ? ay : ax;
-    float t = big > 0 ? small / big : 0, s = t * t, p;
-    int32_t i;
-    p = -0.0006452896099f;
-    p = p * s + 0.003479549227f;
-    p = p * s - 0.008898663359f;
-    p = p * s + 0.01534600094f;
-    p = p * s - 0.02213626529f;
-    p = p * s + 0.03174594614f;
-    p = p * s - 0.05304612139f;
-    p = p * s + 0.1591548374f;
+    float t = big > 0 ? small / big : 0, s = t * t, p, q;
+    int32_t i, swap = -(int32_t)(ay > ax), left = -(int32_t)(dx < 0), below = -(int32_t)(dy < 0);
+    q = s * s;
+    p = (0.01534600094f - 0.008898663359f * s) + q * (0.003479549227f - 0.0006452896099f * s);
+    p = (0.1591548374f - 0.05304612139f * s) + q * ((0.03174594614f - 0.02213626529f * s) + q * p);
     p = p * t;
     p = p > 0 ? p : 0; /* NaN too */
     i = (int32_t)((p < 0.125f ? p : 0.125f) * 67108864.0f);
-    i = ay > ax ? 16777216 - i : i;
-    i = dx < 0 ? 33554432 - i : i;
-    i = dy < 0 ? 67108863 - i : i;
+    i = (i ^ swap) - swap + (swap & 16777216); /* a quarter turn - i; without branches */
+    i = (i ^ left) - left + (left & 33554432); /* half a turn - i */
+    i = (i ^ below) + (below & 67108864);      /* a turn - i - 1 */
     *x = ((uint32_t)i >> 2) & 0xffffffu;
     z = z > -1 ? z : -1;
     z = z < 1 ? z : 1;
@@ -738,8 +737,10 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_MAX_VALUE 9.9e29     /* radiance or weight from here on is a bad sample */
 #define GSDI_MAX_ROOT 1e15        /* values are clamped to this before squaring */
 #define GSDI_CONFIDENCE 1.645     /* one-sided 95 % of the normal distribution */
-#define GSDI_MIN_EFFECTIVE 32.0   /* effective non-zero samples for a verdict "does not pay"; tuned: fewer flips cells
-                                     whose light is rarely found */
+#define GSDI_MIN_EFFECTIVE 128.0  /* effective non-zero samples for the verdict "this tree does not pay"; fewer closes
+                                     cells whose light is rarely found */
+#define GSDI_MIN_EVEN 32.0        /* for "too even to pay" */
+#define GSDI_MIN_OPEN 4.0         /* for "pays" */
 #define GSDI_ENOUGH_HITS 256u      /* non-zero samples of a cell and pass; from then on the gate takes one of eight */
 #define GSDI_MIN_REBUILDS 3         /* before that verdict: the first trees are noise */
 #define GSDI_HISTORY 0.5          /* share of the sums kept where passes do not grow */
@@ -796,6 +797,7 @@ typedef struct gsdi_state {
     double v[GSDI_GATE_LOW + 1];      /* sum of x_a = contribution^2 / (p p_a); the last is a = 1 */
     double vv[GSDI_GATE_LOW + 1];     /* sum of x_a^2 */
     double cross[GSDI_GATE_LOW];      /* sum of x_a x_1 */
+    double weight;                    /* sum of contribution / p */
     float theta, moment1, moment2;    /* Adam: alpha = sigmoid(theta) */
     uint32_t steps;
     float alpha;    /* learned; what queries see is in gsd_cell */
@@ -1085,6 +1087,10 @@ static void gsdi_splat_box(const uint32_t *child, double *sum, uint32_t x, uint3
             int32_t width = xs[i + 1] - xs[i];
             if (width == 0 || height == 0)
                 continue;
+            if (xs[i] <= (int32_t)x && (int32_t)x < xs[i + 1] && ys[j] <= (int32_t)y && (int32_t)y < ys[j + 1]) {
+                sum[leaf] += weight * ((double)width * (double)height);
+                continue;
+            }
             while (child[node] && shift > 24 - depth) {
                 --shift;
                 node = child[node] + ((left >> shift) & 1u) + 2 * ((bottom >> shift) & 1u);
@@ -1243,10 +1249,9 @@ static bool gsdi_locate(gsdi_accumulation *a, const gsd_training_sample *s, uint
     a->read_cell[at] = a->target_cell[at] = cell;
     state = &a->field->states[cell];
     for (axis = 0; axis < 3; ++axis) {
-        uint32_t extent = gsd_cell_extent(state->level, axis), inside = g[axis] - state->origin[axis];
-        bin = bin << 2 | (extent >= 4 ? inside / (extent >> 2) : 0);
+        bin = bin << 2 | ((g[axis] >> (22 - (state->level + 2 - axis) / 3)) & 3u);
     }
-    item->x |= (bin & 63u) << 24;
+    item->x |= bin << 24;
     if (a->stochastic) {
         double u[3];
         gsdi_sample_random(s, u);
@@ -1334,6 +1339,7 @@ static void gsdi_gate_add(gsdi_state *state, double g, double p, double pb, doub
     int k;
     g = g < GSDI_MAX_ROOT ? g : GSDI_MAX_ROOT;
     q = g * (g / p);
+    state->weight += g / p;
     pb = pb > 1e-4 * p ? pb : 1e-4 * p;
     for (k = 0; k <= GSDI_GATE_LOW; ++k) {
         double a = gsdi_gate_alpha[k];
@@ -1353,7 +1359,7 @@ static void gsdi_learn(const gsdi_accumulation *a, gsdi_state *state, const gsd_
     uint32_t x = item->x & 0xffffffu, y = item->y & 0xffffffu;
     double p = (double)item->pdf_mix, pb = (double)item->pdf_bsdf, pg = (double)item->pdf_guide;
     double c = (double)item->contribution, value = (double)item->value;
-    bool judge = a->judge && handle->root && (state->gate != GSD_GATE_CLOSED || state->probe == 0);
+    bool judge = a->judge && (state->gate != GSD_GATE_CLOSED || state->probe == 0);
     bool weigh = a->second_moment && !desc->no_guide_weight && value > 0;
     state->fresh += 1;
     state->bins[item->x >> 24] += 1;
@@ -1363,8 +1369,8 @@ static void gsdi_learn(const gsdi_accumulation *a, gsdi_state *state, const gsd_
         pg = (double)a->view.nodes[gsd_leaf_at(&a->view, handle, x, y)].leaf.pdf;
     if (judge && c > 0) {
         state->hits++;
-        gsdi_gate_add(state, c, p, pb, pg);
-        if (desc->alpha_mode == GSD_ALPHA_ADAM)
+        gsdi_gate_add(state, c, p, pb, handle->root ? pg : pb); /* without a tree: neutral */
+        if (handle->root && desc->alpha_mode == GSD_ALPHA_ADAM)
             gsdi_adam(state, c < GSDI_MAX_ROOT ? c : GSDI_MAX_ROOT, p, pb, pg, a->second_moment);
     }
     if (a->second_moment) {
@@ -1547,13 +1553,13 @@ GSD_API gsd_result gsd_accumulate(gsd_field *field, gsd_stream *const *streams, 
 
 /* ---- >>gate ------------------------------------------------------------------------------------------------- */
 
-/* Mean and standard error of y = x_1 - (1 + margin) x_a, from the sums. Positive: guiding with alpha a pays. */
-static void gsdi_gate_difference(const gsdi_state *s, int a, double margin, double *mean, double *error)
+/* Mean and standard error of y = f1 x_1 - fa x_a, from the sums. */
+static void gsdi_gate_difference(const gsdi_state *s, double f1, int a, double fa, double *mean, double *error)
 {
-    double n = s->gate_count, f = 1 + margin, square;
-    *mean = (s->v[GSDI_GATE_LOW] - f * s->v[a]) / n;
-    square = (s->vv[GSDI_GATE_LOW] - 2 * f * s->cross[a] + f * f * s->vv[a]) / n - *mean * *mean;
-    *error = sqrt((square > 0 ? square : 0) / n);
+    double n = s->gate_count, square;
+    *mean = (f1 * s->v[GSDI_GATE_LOW] - fa * s->v[a]) / n;
+    square = (f1 * f1 * s->vv[GSDI_GATE_LOW] - 2 * f1 * fa * s->cross[a] + fa * fa * s->vv[a]) / n - *mean * *mean;
+    *error = GSDI_CONFIDENCE * sqrt((square > 0 ? square : 0) / n);
 }
 
 /* Kish's effective number of samples behind V(1). */
@@ -1570,10 +1576,10 @@ static float gsdi_grid_alpha(const gsdi_state *s)
     const double *x = gsdi_gate_alpha, *v = s->v;
     double best, n = gsdi_gate_effective(s), d0, d1, bend;
     int k, low = 0;
-    if (!(n > 0))
-        return s->alpha;
     for (k = 1; k <= GSDI_GATE_LOW; ++k)
         low = v[k] < v[low] ? k : low;
+    if (!(v[0] > v[low] || v[GSDI_GATE_LOW] > v[low])) /* nothing known: no light, or no tree yet */
+        return s->alpha;
     k = low < 1 ? 1 : low > GSDI_GATE_LOW - 1 ? GSDI_GATE_LOW - 1 : low;
     d0 = (v[k] - v[k - 1]) / (x[k] - x[k - 1]);
     d1 = (v[k + 1] - v[k]) / (x[k + 1] - x[k]);
@@ -1584,13 +1590,37 @@ static float gsdi_grid_alpha(const gsdi_state *s)
     return (float)best;
 }
 
-/* Verdict on a cell after a pass; fades its sums. See "Gate" in the opening comment. */
+/* Open, close or leave a cell; see "Gate" in the opening comment. */
+static void gsdi_verdict(const gsd_desc *desc, gsdi_state *s, gsd_stats *stats)
+{
+    bool closed = s->gate == GSD_GATE_CLOSED;
+    double n = gsdi_gate_effective(s), m = s->weight / s->gate_count, mean, error, even, even_error;
+    double margin = (double)desc->gate_margin * (closed ? 2 : 1), need = (double)desc->gate_gain * m * m;
+    double limit = (1 + (double)desc->gate_gain) * m * m;
+    int k, best = 0;
+    stats->probed += closed;
+    for (k = 1; k < GSDI_GATE_LOW; ++k)
+        best = s->v[k] < s->v[best] ? k : best;
+    gsdi_gate_difference(s, 1, best, 1 + margin, &mean, &error);
+    gsdi_gate_difference(s, 1, 0, 0, &even, &even_error);
+    mean -= closed ? 1.5 * need : need;
+    if (mean - error > 0 && n >= GSDI_MIN_OPEN) {
+        stats->opened += s->gate != GSD_GATE_OPEN;
+        s->gate = GSD_GATE_OPEN;
+    } else if (closed) { /* not as even as it seemed */
+        s->gate = mean > 0 && even - even_error > 1.5 * limit ? GSD_GATE_UNJUDGED : GSD_GATE_CLOSED;
+    } else if ((even + even_error < limit && n >= GSDI_MIN_EVEN) ||
+               (mean + error < 0 && n >= GSDI_MIN_EFFECTIVE && s->rebuilds >= GSDI_MIN_REBUILDS)) {
+        stats->closed++;
+        s->gate = GSD_GATE_CLOSED;
+    }
+}
+
+/* Verdict on a cell after a pass; fades its sums. */
 static void gsdi_judge(const gsd_desc *desc, gsdi_state *s, gsd_stats *stats)
 {
-    bool trying = s->gate != GSD_GATE_CLOSED || s->probe == 0;
-    double mean, error, margin = (double)desc->gate_margin;
-    int k, best = 0;
-    if (!trying) {
+    int k;
+    if (s->gate == GSD_GATE_CLOSED && s->probe > 0) {
         s->probe--;
         return;
     }
@@ -1598,20 +1628,8 @@ static void gsdi_judge(const gsd_desc *desc, gsdi_state *s, gsd_stats *stats)
         s->alpha = gsdi_grid_alpha(s);
     else if (desc->alpha_mode == GSD_ALPHA_ADAM)
         s->alpha = 1 / (1 + expf(-s->theta));
-    if (!desc->no_gate && s->gate_count > 0 && gsdi_gate_effective(s) > 0) {
-        stats->probed += s->gate == GSD_GATE_CLOSED;
-        for (k = 1; k < GSDI_GATE_LOW; ++k)
-            best = s->v[k] < s->v[best] ? k : best;
-        gsdi_gate_difference(s, best, s->gate == GSD_GATE_CLOSED ? 2 * margin : margin, &mean, &error);
-        if (mean - GSDI_CONFIDENCE * error > 0 && gsdi_gate_effective(s) >= 4) {
-            stats->opened += s->gate != GSD_GATE_OPEN;
-            s->gate = GSD_GATE_OPEN;
-        } else if (s->gate != GSD_GATE_CLOSED && s->rebuilds >= GSDI_MIN_REBUILDS &&
-                   mean + GSDI_CONFIDENCE * error < 0 && gsdi_gate_effective(s) >= GSDI_MIN_EFFECTIVE) {
-            stats->closed++;
-            s->gate = GSD_GATE_CLOSED;
-        }
-    }
+    if (!desc->no_gate && s->gate_count > 0 && gsdi_gate_effective(s) > 0)
+        gsdi_verdict(desc, s, stats);
     if (s->gate == GSD_GATE_CLOSED)
         s->probe = desc->gate_probe - 1;
     for (k = 0; k <= GSDI_GATE_LOW; ++k) {
@@ -1621,6 +1639,7 @@ static void gsdi_judge(const gsd_desc *desc, gsdi_state *s, gsd_stats *stats)
             s->cross[k] *= 0.5;
     }
     s->gate_count *= 0.5;
+    s->weight *= 0.5;
 }
 
 /* ---- >>block ------------------------------------------------------------------------------------------------ */
@@ -2017,7 +2036,7 @@ static void gsdi_split_cell(gsdi_refinement *r, uint32_t cell, uint32_t node)
         struct gsdi_part p = stack[top--];
         gsdi_place *a = &r->places[p.place], *b;
         uint32_t axis = a->level % 3, k;
-        if (!r->jobs[cell].rebuild || p.levels == 6 || (double)a->samples <= r->split ||
+        if (!r->jobs[cell].rebuild || s->gate == GSD_GATE_CLOSED || p.levels == 6 || (double)a->samples <= r->split ||
             a->level >= r->desc->max_levels || r->cells >= r->cell_limit || r->cells >= r->place_capacity)
             continue;
         r->stats.split_cells++;
@@ -2219,6 +2238,7 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
                     s->cross[k] *= share;
             }
             s->gate_count *= share;
+            s->weight *= share;
         }
         if (r->clear) { /* another target: what waits is of no use */
             s->held = 0;
@@ -2469,7 +2489,7 @@ GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
     d.directional_filter = d.directional_filter ? d.directional_filter : GSD_DIRECTIONAL_BOX;
     d.alpha_mode = d.alpha_mode ? d.alpha_mode : GSD_ALPHA_GRID;
     gsdi_default_u32(&d.switch_pass, 4);
-    gsdi_default_float(&d.split_samples, 4000);
+    gsdi_default_float(&d.split_samples, 1000);
     gsdi_default_float(&d.rho, 0.01f);
     gsdi_default_u32(&d.max_depth, 16);
     gsdi_default_u32(&d.max_levels, 48);
@@ -2477,7 +2497,8 @@ GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
     d.max_bytes = d.max_bytes ? d.max_bytes : (uint64_t)1 << 30;
     gsdi_default_float(&d.alpha, 0.5f);
     gsdi_default_float(&d.uniform, 0.01f);
-    gsdi_default_float(&d.gate_margin, 0.15f);
+    gsdi_default_float(&d.gate_margin, 0.05f);
+    gsdi_default_float(&d.gate_gain, 4);
     gsdi_default_u32(&d.gate_probe, 1);
     if ((unsigned)d.target > GSD_TARGET_SWITCHING || (unsigned)d.spatial_filter > GSD_SPATIAL_STOCHASTIC ||
         (unsigned)d.directional_filter > GSD_DIRECTIONAL_BOX || (unsigned)d.alpha_mode > GSD_ALPHA_GRID ||
@@ -2490,7 +2511,7 @@ GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
         !gsdi_within((double)d.rho, 0.99e-5, 1) || !gsdi_within(d.max_depth, 1, 20) ||
         !gsdi_within(d.max_levels, 1, 60) || !gsdi_within((double)d.alpha, 0.0499, 1) ||
         !gsdi_within((double)d.uniform, 0.99e-4, 1) || !gsdi_within((double)d.gate_margin, 0.99e-3, 10) ||
-        !gsdi_within(d.gate_probe, 1, 1000) || d.max_bytes < 1u << 20 || d.forest_cells > GSDI_MAX_CELLS)
+        !gsdi_within((double)d.gate_gain, 0.99e-3, 1000) || !gsdi_within(d.gate_probe, 1, 1000) || d.max_bytes < 1u << 20 || d.forest_cells > GSDI_MAX_CELLS)
         return GSD_BAD_RANGE;
     if (!d.forest_cells && !gsdi_bounds_ok(&d))
         return GSD_BAD_BOUNDS;
@@ -2739,6 +2760,7 @@ GSD_API gsd_result gsd_forest_split(gsd_field *field, uint32_t parent, uint32_t 
     s->held *= 0.5;
     s->fresh *= 0.5;
     s->gate_count *= 0.5;
+    s->weight *= 0.5;
     for (k = 0; k <= GSDI_GATE_LOW; ++k) {
         s->v[k] *= 0.5;
         s->vv[k] *= 0.5;
@@ -2938,6 +2960,251 @@ static void gsdi_draw_alias(const gsd_view *view, gsdi_draw *d)
     GSDI_PREFETCH(&view->nodes[d->node]);
 }
 
+#if GSDI_X86
+#define GSDI_AVX2 __attribute__((target("avx2")))
+
+/* Sixteen draws as arrays. The steps are those of gsd_sample, in the same operations, so results are equal bit by bit. */
+typedef struct gsdi_draws {
+    double r[2][GSDI_LANES], lo[2][GSDI_LANES], width[2][GSDI_LANES];
+    uint32_t bits[2][GSDI_LANES]; /* of u, 24 each; then extended to 32 */
+    uint32_t node[GSDI_LANES];
+    float out[3][GSDI_LANES], pdf[GSDI_LANES];
+    uint32_t edge[GSDI_LANES]; /* not 0: near the leaf's edge */
+} gsdi_draws;
+
+/* Four 32-bit numbers without sign as doubles. */
+GSDI_AVX2 static __m256d gsdi_u32_double(__m128i x)
+{
+    return _mm256_add_pd(_mm256_cvtepi32_pd(_mm_xor_si128(x, _mm_set1_epi32((int)0x80000000u))),
+                         _mm256_set1_pd(2147483648.0));
+}
+
+/* gsd_extend_random, then r[0] without the uniform share. */
+GSDI_AVX2 static void gsdi_extend_avx2(gsdi_draws *d, double e)
+{
+    __m256d scale = _mm256_set1_pd(2.3283064365386963e-10);
+    uint32_t i;
+    for (i = 0; i < GSDI_LANES; i += 4) {
+        __m128i a = _mm_loadu_si128((const __m128i *)(const void *)&d->bits[0][i]);
+        __m128i b = _mm_loadu_si128((const __m128i *)(const void *)&d->bits[1][i]), h, low = _mm_set1_epi32(255);
+        h = _mm_xor_si128(_mm_mullo_epi32(a, _mm_set1_epi32((int)0x9e3779b1u)),
+                          _mm_add_epi32(_mm_mullo_epi32(b, _mm_set1_epi32((int)0x85ebca6bu)),
+                                        _mm_set1_epi32(0x27d4eb2f)));
+        h = _mm_mullo_epi32(_mm_xor_si128(h, _mm_srli_epi32(h, 15)), _mm_set1_epi32(0x2c1b3c6d));
+        h = _mm_xor_si128(h, _mm_srli_epi32(h, 13));
+        a = _mm_or_si128(_mm_slli_epi32(a, 8), _mm_and_si128(h, low));
+        b = _mm_or_si128(_mm_slli_epi32(b, 8), _mm_and_si128(_mm_srli_epi32(h, 8), low));
+        _mm256_storeu_pd(&d->r[1][i], _mm256_mul_pd(gsdi_u32_double(b), scale));
+        _mm256_storeu_pd(&d->r[0][i], _mm256_min_pd(_mm256_div_pd(_mm256_sub_pd(_mm256_mul_pd(gsdi_u32_double(a), scale),
+                                                                                _mm256_set1_pd(e)),
+                                                                  _mm256_set1_pd(1 - e)),
+                                                    _mm256_set1_pd(0.99999999988)));
+    }
+}
+
+/* Eight nodes from lane i on, their four words in columns. */
+GSDI_AVX2 static void gsdi_nodes_avx2(const gsd_node *nodes, const uint32_t *node, __m256 column[4])
+{
+    __m256 row[4], t[4];
+    uint32_t i;
+    for (i = 0; i < 4; ++i)
+        row[i] = _mm256_insertf128_ps(
+            _mm256_castps128_ps256(_mm_loadu_ps((const float *)(const void *)&nodes[node[i]])),
+            _mm_loadu_ps((const float *)(const void *)&nodes[node[i + 4]]), 1);
+    t[0] = _mm256_unpacklo_ps(row[0], row[1]);
+    t[1] = _mm256_unpackhi_ps(row[0], row[1]);
+    t[2] = _mm256_unpacklo_ps(row[2], row[3]);
+    t[3] = _mm256_unpackhi_ps(row[2], row[3]);
+    column[0] = _mm256_shuffle_ps(t[0], t[2], 0x44);
+    column[1] = _mm256_shuffle_ps(t[0], t[2], 0xee);
+    column[2] = _mm256_shuffle_ps(t[1], t[3], 0x44);
+    column[3] = _mm256_shuffle_ps(t[1], t[3], 0xee);
+}
+
+/* Narrow four intervals of one axis by split, where active; returns which took the upper half. */
+GSDI_AVX2 static __m256d gsdi_narrow_avx2(const double *r, double *lo, double *width, __m256d split, __m256d active)
+{
+    __m256d l = _mm256_loadu_pd(lo), full = _mm256_loadu_pd(width), w = _mm256_mul_pd(full, split);
+    __m256d middle = _mm256_add_pd(l, w), upper;
+    upper = _mm256_and_pd(_mm256_cmp_pd(_mm256_loadu_pd(r), middle, _CMP_GE_OQ), _mm256_cmp_pd(w, full, _CMP_LT_OQ));
+    _mm256_storeu_pd(lo, _mm256_blendv_pd(l, middle, _mm256_and_pd(upper, active)));
+    _mm256_storeu_pd(width,
+                     _mm256_blendv_pd(full, _mm256_blendv_pd(w, _mm256_sub_pd(full, w), upper), active));
+    return upper;
+}
+
+/* Masks of four doubles as four 32-bit masks. */
+GSDI_AVX2 static __m128i gsdi_mask_avx2(__m256d mask)
+{
+    __m256i order = _mm256_setr_epi32(0, 2, 4, 6, 0, 2, 4, 6);
+    return _mm256_castsi256_si128(_mm256_permutevar8x32_epi32(_mm256_castpd_si256(mask), order));
+}
+
+/* One level down for eight lanes; false when all are at leaves. */
+GSDI_AVX2 static bool gsdi_step_avx2(const gsd_view *view, gsdi_draws *d, uint32_t lane)
+{
+    __m256 column[4];
+    __m256i child, active, next;
+    __m128i bx[2], by[2];
+    uint32_t half, i;
+    gsdi_nodes_avx2(view->nodes, &d->node[lane], column);
+    child = _mm256_castps_si256(column[0]);
+    active = _mm256_xor_si256(_mm256_cmpeq_epi32(child, _mm256_setzero_si256()), _mm256_set1_epi32(-1));
+    if (_mm256_testz_si256(active, active))
+        return false;
+    for (half = 0; half < 2; ++half) {
+        uint32_t at = lane + half * 4;
+        __m256d act = _mm256_castsi256_pd(_mm256_cvtepi32_epi64(
+            half ? _mm256_extracti128_si256(active, 1) : _mm256_castsi256_si128(active)));
+        __m256d s0 = _mm256_cvtps_pd(half ? _mm256_extractf128_ps(column[1], 1) : _mm256_castps256_ps128(column[1]));
+        __m256d s1 = _mm256_cvtps_pd(half ? _mm256_extractf128_ps(column[2], 1) : _mm256_castps256_ps128(column[2]));
+        __m256d s2 = _mm256_cvtps_pd(half ? _mm256_extractf128_ps(column[3], 1) : _mm256_castps256_ps128(column[3]));
+        __m256d x = gsdi_narrow_avx2(&d->r[0][at], &d->lo[0][at], &d->width[0][at], s0, act), y;
+        y = gsdi_narrow_avx2(&d->r[1][at], &d->lo[1][at], &d->width[1][at], _mm256_blendv_pd(s1, s2, x), act);
+        bx[half] = gsdi_mask_avx2(x);
+        by[half] = gsdi_mask_avx2(y);
+    }
+    next = _mm256_sub_epi32(child, _mm256_inserti128_si256(_mm256_castsi128_si256(bx[0]), bx[1], 1));
+    next = _mm256_sub_epi32(next,
+                            _mm256_slli_epi32(_mm256_inserti128_si256(_mm256_castsi128_si256(by[0]), by[1], 1), 1));
+    next = _mm256_blendv_epi8(_mm256_loadu_si256((const __m256i *)(const void *)&d->node[lane]), next, active);
+    _mm256_storeu_si256((__m256i *)(void *)&d->node[lane], next);
+    for (i = 0; i < 8; ++i)
+        GSDI_PREFETCH(&view->nodes[d->node[lane + i]]);
+    return true;
+}
+
+/* Places in the leaves: coordinates r in units of 2^-24, whether near the edge, pdf. */
+GSDI_AVX2 static void gsdi_leaves_avx2(const gsd_view *view, gsdi_draws *d, uint32_t lane)
+{
+    __m256 column[4];
+    uint32_t half, k;
+    gsdi_nodes_avx2(view->nodes, &d->node[lane], column);
+    _mm256_storeu_ps(&d->pdf[lane], column[1]);
+    for (half = 0; half < 2; ++half) {
+        uint32_t at = lane + half * 4;
+        __m128i xd = _mm_castps_si128(half ? _mm256_extractf128_ps(column[2], 1) : _mm256_castps256_ps128(column[2]));
+        __m128i y = _mm_castps_si128(half ? _mm256_extractf128_ps(column[3], 1) : _mm256_castps256_ps128(column[3]));
+        __m256d size = _mm256_cvtepi32_pd(_mm_srlv_epi32(_mm_set1_epi32(16777216), _mm_srli_epi32(xd, 24)));
+        __m256d edge = _mm256_setzero_pd(), corner[2];
+        corner[0] = _mm256_cvtepi32_pd(_mm_and_si128(xd, _mm_set1_epi32(0xffffff)));
+        corner[1] = _mm256_cvtepi32_pd(y);
+        for (k = 0; k < 2; ++k) {
+            __m256d t = _mm256_div_pd(_mm256_sub_pd(_mm256_loadu_pd(&d->r[k][at]), _mm256_loadu_pd(&d->lo[k][at])),
+                                      _mm256_loadu_pd(&d->width[k][at])), f;
+            t = _mm256_max_pd(t, _mm256_setzero_pd());
+            f = _mm256_mul_pd(_mm256_min_pd(t, _mm256_set1_pd(0.99999999988)), size);
+            edge = _mm256_or_pd(edge, _mm256_cmp_pd(f, _mm256_set1_pd(2), _CMP_LT_OQ));
+            edge = _mm256_or_pd(edge, _mm256_cmp_pd(f, _mm256_sub_pd(size, _mm256_set1_pd(2)), _CMP_GT_OQ));
+            _mm256_storeu_pd(&d->r[k][at], _mm256_add_pd(corner[k], f));
+        }
+        _mm_storeu_si128((__m128i *)(void *)&d->edge[at], gsdi_mask_avx2(edge));
+    }
+}
+
+/* gsd_direction for eight lanes. */
+GSDI_AVX2 static void gsdi_directions_avx2(gsdi_draws *d, uint32_t lane)
+{
+    __m128 fh[2], zh[2];
+    __m128i qh[2];
+    __m256 f, g, s, c, r, z, one = _mm256_set1_ps(1), odd, a;
+    __m256i q;
+    uint32_t half;
+    for (half = 0; half < 2; ++half) {
+        __m256d turn = _mm256_mul_pd(_mm256_loadu_pd(&d->r[0][lane + half * 4]), _mm256_set1_pd(5.9604644775390625e-8));
+        qh[half] = _mm256_cvttpd_epi32(_mm256_add_pd(_mm256_mul_pd(turn, _mm256_set1_pd(4)), _mm256_set1_pd(0.5)));
+        fh[half] = _mm256_cvtpd_ps(
+            _mm256_sub_pd(turn, _mm256_mul_pd(_mm256_set1_pd(0.25), _mm256_cvtepi32_pd(qh[half]))));
+        zh[half] = _mm256_cvtpd_ps(_mm256_sub_pd(_mm256_mul_pd(_mm256_loadu_pd(&d->r[1][lane + half * 4]),
+                                                               _mm256_set1_pd(1.1920928955078125e-7)),
+                                                 _mm256_set1_pd(1)));
+    }
+    f = _mm256_insertf128_ps(_mm256_castps128_ps256(fh[0]), fh[1], 1);
+    z = _mm256_insertf128_ps(_mm256_castps128_ps256(zh[0]), zh[1], 1);
+    q = _mm256_inserti128_si256(_mm256_castsi128_si256(qh[0]), qh[1], 1);
+    g = _mm256_mul_ps(f, f);
+    s = _mm256_add_ps(_mm256_set1_ps(81.5880703f), _mm256_mul_ps(g, _mm256_set1_ps(-75.2377448f)));
+    s = _mm256_add_ps(_mm256_set1_ps(-41.3416277f), _mm256_mul_ps(g, s));
+    s = _mm256_mul_ps(f, _mm256_add_ps(_mm256_set1_ps(6.28318522f), _mm256_mul_ps(g, s)));
+    c = _mm256_add_ps(_mm256_set1_ps(-85.4436999f), _mm256_mul_ps(g, _mm256_set1_ps(59.2443711f)));
+    c = _mm256_add_ps(_mm256_set1_ps(64.9393261f), _mm256_mul_ps(g, c));
+    c = _mm256_add_ps(_mm256_set1_ps(-19.7392087f), _mm256_mul_ps(g, c));
+    c = _mm256_add_ps(one, _mm256_mul_ps(g, c));
+    z = _mm256_min_ps(_mm256_max_ps(z, _mm256_set1_ps(-1)), one);
+    r = _mm256_sqrt_ps(_mm256_mul_ps(_mm256_sub_ps(one, z), _mm256_add_ps(one, z)));
+    odd = _mm256_castsi256_ps(_mm256_slli_epi32(q, 31));
+    a = _mm256_blendv_ps(c, _mm256_xor_ps(s, _mm256_set1_ps(-0.0f)), odd);
+    s = _mm256_blendv_ps(s, c, odd);
+    r = _mm256_xor_ps(r, _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_srli_epi32(q, 1), 31)));
+    _mm256_storeu_ps(&d->out[0][lane], _mm256_mul_ps(r, a));
+    _mm256_storeu_ps(&d->out[1][lane], _mm256_mul_ps(r, s));
+    _mm256_storeu_ps(&d->out[2][lane], z);
+}
+
+/* Up to 16 draws. Those of the uniform share, and what has no alias table in a field of them, are done one by one. */
+GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const uint32_t *at, const gsd_handle *handles,
+                                       const float *u, size_t u_stride, float *directions, size_t direction_stride,
+                                       float *pdf)
+{
+    gsdi_draws d;
+    double e = (double)view->uniform;
+    bool aliased = handles[at[0]].alias_count != 0, go[2] = {!aliased, !aliased};
+    uint32_t i, k;
+    for (i = 0; i < GSDI_LANES; ++i) {
+        const float *v = gsdi_row(u, u_stride, at[i < n ? i : 0]);
+        for (k = 0; k < 2; ++k) {
+            int32_t b = (int32_t)(v[k] * 16777216.0f);
+            d.bits[k][i] = b < 16777215 ? (uint32_t)b : 16777215u;
+            d.lo[k][i] = 0;
+            d.width[k][i] = 1;
+        }
+        d.node[i] = handles[at[i < n ? i : 0]].root;
+        GSDI_PREFETCH(&view->nodes[d.node[i]]);
+    }
+    gsdi_extend_avx2(&d, e);
+    for (i = 0; aliased && i < GSDI_LANES; ++i) {
+        const gsd_handle *h = &handles[at[i < n ? i : 0]];
+        double slot = d.r[0][i] * (double)h->alias_count;
+        slot = slot > 0 ? slot : 0; /* the uniform share comes later */
+        d.node[i] = h->alias + (uint32_t)(int64_t)slot;
+        d.r[0][i] = slot - (double)(int64_t)slot;
+        GSDI_PREFETCH(&view->aliases[d.node[i]]);
+    }
+    for (i = 0; aliased && i < GSDI_LANES; ++i) {
+        const gsd_alias *a = &view->aliases[d.node[i]];
+        double t = (double)a->threshold;
+        bool own = d.r[0][i] < t;
+        if (!handles[at[i < n ? i : 0]].alias_count)
+            continue;
+        d.lo[0][i] = own ? 0 : t;
+        d.width[0][i] = own ? t : 1 - t;
+        d.node[i] = own ? a->node : a->other;
+        GSDI_PREFETCH(&view->nodes[d.node[i]]);
+    }
+    for (i = 0; aliased && i < GSDI_LANES; ++i)
+        d.node[i] = handles[at[i < n ? i : 0]].alias_count ? d.node[i] : 0;
+    while (go[0] || go[1]) {
+        go[0] = go[0] && gsdi_step_avx2(view, &d, 0);
+        go[1] = go[1] && gsdi_step_avx2(view, &d, 8);
+    }
+    for (i = 0; i < GSDI_LANES; i += 8) {
+        gsdi_leaves_avx2(view, &d, i);
+        gsdi_directions_avx2(&d, i);
+    }
+    for (i = 0; i < n; ++i) {
+        const gsd_handle *h = &handles[at[i]];
+        float *out = gsdi_row_out(directions, direction_stride, at[i]);
+        if ((double)d.bits[0][i] < e * 16777216.0 + 1 || (h->alias_count != 0) != aliased) {
+            pdf[at[i]] = gsd_sample(view, h, gsdi_row(u, u_stride, at[i]), out);
+            continue;
+        }
+        for (k = 0; k < 3; ++k)
+            out[k] = d.out[k][i];
+        pdf[at[i]] = d.edge[i] ? gsd_pdf(view, h, out) : d.pdf[i];
+    }
+}
+#endif
+
 GSD_API void gsd_sample_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const gsd_handle *handles,
                               const float *u, size_t u_stride, float *directions, size_t direction_stride, float *pdf)
 {
@@ -2947,6 +3214,15 @@ GSD_API void gsd_sample_batch(const gsd_view *view, uint32_t count, const uint32
         gsdi_draw draws[GSDI_LANES];
         int kind[GSDI_LANES];
         bool tree[GSDI_LANES];
+#if GSDI_X86
+        if (view->simd >= GSD_SIMD_AVX2) {
+            uint32_t at[GSDI_LANES];
+            for (i = 0; i < n; ++i)
+                at[i] = gsdi_at(index, start + i);
+            gsdi_sample_avx2(view, n, at, handles, u, u_stride, directions, direction_stride, pdf);
+            continue;
+        }
+#endif
         for (i = 0; i < n; ++i) {
             uint32_t at = gsdi_at(index, start + i);
             kind[i] = gsdi_draw_start(view, &handles[at], gsdi_row(u, u_stride, at), &draws[i]);
@@ -2983,7 +3259,8 @@ typedef struct gsdi_file {
     uint32_t target, switch_pass, max_depth, max_levels, min_samples, spatial_filter, directional_filter, alpha_mode;
     uint32_t no_gate, no_guide_weight, no_history, alias, gate_probe, forest_cells;
     float bounds_min[3], bounds_max[3];
-    float split_samples, rho, alpha, uniform, gate_margin, closed_share, mean_alpha, effective_rho;
+    float split_samples, rho, alpha, uniform, gate_margin, gate_gain, closed_share, mean_alpha, effective_rho;
+    uint32_t reserved;
 } gsdi_file;
 
 #define GSDI_MAGIC "GSDTREE"
@@ -3026,6 +3303,7 @@ static void gsdi_file_options(gsdi_file *f, const gsd_desc *d)
     f->alpha = d->alpha;
     f->uniform = d->uniform;
     f->gate_margin = d->gate_margin;
+    f->gate_gain = d->gate_gain;
 }
 
 static gsd_result gsdi_file_desc(const gsdi_file *f, const gsd_desc *given, gsd_desc *d)
@@ -3053,6 +3331,7 @@ static gsd_result gsdi_file_desc(const gsdi_file *f, const gsd_desc *given, gsd_
     d->alpha = f->alpha;
     d->uniform = f->uniform;
     d->gate_margin = f->gate_margin;
+    d->gate_gain = f->gate_gain;
     if (given) {
         d->allocate = given->allocate;
         d->release = given->release;
@@ -3395,6 +3674,7 @@ static bool gsdi_state_ok(const gsd_field *field, const gsdi_state *s, const gsd
     if (c->tree >= field->block->trees || s->gate > GSD_GATE_CLOSED || !(s->alpha >= 0.049f && s->alpha <= 1) ||
         !(s->theta > -10 && s->theta < 10) || !gsdi_finite(s->moment1) || !gsdi_finite(s->moment2) ||
         !(s->held >= 0 && s->held < 1e18) || !(s->fresh >= 0 && s->fresh < 1e18) || !(s->gate_count >= 0) ||
+        !(s->weight >= 0 && s->weight < 1e300) ||
         s->level > 60)
         return false;
     for (k = 0; k <= GSDI_GATE_LOW; ++k)
@@ -3452,6 +3732,7 @@ GSD_API gsd_result gsd_merge(gsd_field *field, const gsd_field *source)
         s->held += o->held;
         s->fresh += o->fresh;
         s->gate_count += o->gate_count;
+        s->weight += o->weight;
         s->theta += (float)(share * ((double)o->theta - (double)s->theta));
         for (k = 0; k <= GSDI_GATE_LOW; ++k) {
             s->v[k] += o->v[k];

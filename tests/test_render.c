@@ -318,10 +318,10 @@ static void closed_gate_changes_no_bit(void **state)
     tr_scene *scene = load("cornell", NULL, NULL);
     tr_settings s = small("pt", 31);
     tr_result pt = render(scene, &s);
-    tr_option off = {"guide", "off", false};
+    tr_option off[] = {{"alpha", "1", false}, {"learn_alpha", "off", false}};
     s.method = tr_method_find("sdtree");
-    s.options = &off;
-    s.option_count = 1;
+    s.options = off;
+    s.option_count = 2;
     tr_result closed = render(scene, &s);
     assert_memory_equal(pt.color.data, closed.color.data, sizeof(float) * 80 * 48 * 3);
     tr_result_free(&pt);

@@ -3,7 +3,7 @@
    Options (--set key=value), defaults as in guide_sdtree.h: target=radiance|simple|variance|switching, switch_pass, c
    (samples of a cell before it splits), rho, max_depth, max_levels, min_samples, max_memory_mb,
    spatial_filter=nearest|stochastic, directional_filter=nearest|box, learn_alpha=grid|adam|off (on = grid), alpha,
-   gate=on|off, gate_margin, gate_probe, guide_weight=on|off, history=on|off, uniform, alias=on|off,
+   gate=on|off, gate_margin, gate_gain, gate_probe, guide_weight=on|off, history=on|off, uniform, alias=on|off,
    simd=scalar|avx2|avx512, jitter=on|off (find looks up a jittered position), sparse=on|off (closed fields record only
    some tiles). */
 #include <stdlib.h>
@@ -101,6 +101,7 @@ static bool parse(parser *p, gsd_desc *d, sdtree *m)
     d->uniform = (float)number(p, "uniform", 0);
     d->no_gate = choice(p, "gate", "off|on") == 0;
     d->gate_margin = (float)number(p, "gate_margin", 0);
+    d->gate_gain = (float)number(p, "gate_gain", 0);
     d->gate_probe = (uint32_t)number(p, "gate_probe", 0);
     d->no_guide_weight = choice(p, "guide_weight", "off|on") == 0;
     d->no_history = choice(p, "history", "off|on") == 0;

@@ -1,0 +1,1710 @@
+/* test_sdtree.c: guide_sdtree.h against independent references in double precision.
+
+   gcc -std=c11 -O2 -I. tests/test_sdtree.c -lcmocka -lm -lpthread
+   GUIDE_TEST_LONG=1 takes ten times as many samples in the statistical tests. */
+#define _POSIX_C_SOURCE 200809L
+#include "cmocka_prelude.h"
+
+#include <float.h>
+#include <math.h>
+#include <pthread.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define GSD_IMPLEMENTATION
+#include "guide_sdtree.h"
+
+#define PI 3.14159265358979323846
+
+/* ---- helpers */
+
+static uint64_t rng_state = 1;
+
+static void seed(uint64_t s) { rng_state = s * 0x9e3779b97f4a7c15ull + 1; }
+
+static uint64_t rng_next(void)
+{
+    uint64_t z = rng_state += 0x9e3779b97f4a7c15ull;
+    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9ull;
+    z = (z ^ (z >> 27)) * 0x94d049bb133111ebull;
+    return z ^ (z >> 31);
+}
+
+static double rnd(void) { return (double)(rng_next() >> 11) * 0x1p-53; }
+static float rndf(void) { return (float)(rng_next() >> 40) * 0x1p-24f; }
+
+static void random_direction(float d[3])
+{
+    double z = 2 * rnd() - 1, phi = 2 * PI * rnd(), r = sqrt(1 - z * z);
+    d[0] = (float)(r * cos(phi));
+    d[1] = (float)(r * sin(phi));
+    d[2] = (float)z;
+}
+
+static long scaled(long n) { return getenv("GUIDE_TEST_LONG") ? 10 * n : n; }
+
+#define OK(call) assert_int_equal((call), GSD_OK)
+
+static gsd_desc unit_cube(gsd_target target)
+{
+    gsd_desc d;
+    memset(&d, 0, sizeof d);
+    d.bounds_max[0] = d.bounds_max[1] = d.bounds_max[2] = 1;
+    d.target = target;
+    return d;
+}
+
+/* An allocator that counts, and fails from the fail_at-th request on (for one request, or all with fail_all). */
+typedef struct counter {
+    long live, requests, fail_at;
+    size_t bytes, peak;
+    bool fail_all;
+} counter;
+
+static void *count_allocate(void *user, size_t size)
+{
+    counter *c = user;
+    c->requests++;
+    if (c->fail_at && (c->requests == c->fail_at || (c->fail_all && c->requests > c->fail_at)))
+        return NULL;
+    size_t *p = malloc(size + 16);
+    if (!p)
+        return NULL;
+    p[0] = size;
+    c->live++;
+    c->bytes += size;
+    c->peak = c->bytes > c->peak ? c->bytes : c->peak;
+    return (char *)p + 16;
+}
+
+static void count_release(void *user, void *pointer)
+{
+    counter *c = user;
+    if (!pointer)
+        return;
+    size_t *p = (size_t *)(void *)((char *)pointer - 16);
+    c->live--;
+    c->bytes -= p[0];
+    free(p);
+}
+
+static void use_counter(gsd_desc *d, counter *c)
+{
+    d->allocate = count_allocate;
+    d->release = count_release;
+    d->user = c;
+}
+
+/* parallel_for on `threads` threads, ranges handed out in small pieces from the end, to mix up the order. */
+typedef struct crowd {
+    int threads;
+} crowd;
+typedef struct crowd_job {
+    gsd_range_fn fn;
+    void *context;
+    uint32_t count, grain;
+    int threads, me;
+} crowd_job;
+
+static void *crowd_main(void *p)
+{
+    crowd_job *j = p;
+    uint32_t pieces = (j->count + j->grain - 1) / j->grain;
+    for (uint32_t k = 0; k < pieces; ++k)
+        if (k % (uint32_t)j->threads == (uint32_t)j->me) {
+            uint32_t piece = pieces - 1 - k, begin = piece * j->grain;
+            uint32_t end = begin + j->grain < j->count ? begin + j->grain : j->count;
+            j->fn(j->context, begin, end);
+        }
+    return NULL;
+}
+
+static void crowd_for(void *user, uint32_t count, uint32_t grain, gsd_range_fn fn, void *context)
+{
+    crowd *c = user;
+    pthread_t threads[8];
+    crowd_job jobs[8];
+    for (int i = 0; i < c->threads; ++i) {
+        jobs[i] = (crowd_job){fn, context, count, grain ? grain : 1, c->threads, i};
+        assert_int_equal(pthread_create(&threads[i], NULL, crowd_main, &jobs[i]), 0);
+    }
+    for (int i = 0; i < c->threads; ++i)
+        pthread_join(threads[i], NULL);
+}
+
+/* A random quadtree as plain arrays: grows `inner` nodes, preferring deep ones, to max_depth. */
+static gsd_tree random_tree(uint32_t cell, uint32_t inner, uint32_t max_depth)
+{
+    gsd_tree t = {cell, 1, calloc(inner * 4, sizeof(uint32_t)), calloc(inner * 4, sizeof(float))};
+    uint32_t *depth = calloc(inner, sizeof *depth);
+    for (uint32_t i = 0; i < inner * 4; ++i)
+        t.value[i] = rnd() < 0.15 ? 0 : (float)exp(6 * rnd());
+    for (uint32_t tries = 0; t.count < inner && tries < inner * 100; ++tries) {
+        uint32_t parent = rnd() < 0.5 ? t.count - 1 : (uint32_t)(rnd() * t.count), k = (uint32_t)(rnd() * 4);
+        if (depth[parent] + 2 > max_depth || t.child[parent * 4 + k])
+            continue;
+        t.child[parent * 4 + k] = t.count;
+        depth[t.count++] = depth[parent] + 1;
+    }
+    free(depth);
+    return t;
+}
+
+static void free_tree(gsd_tree *t)
+{
+    free(t->child);
+    free(t->value);
+}
+
+/* A forest with one imported tree per cell. */
+static gsd_field *forest_of(uint32_t cells, uint32_t inner, uint32_t max_depth, bool alias, gsd_simd simd)
+{
+    gsd_desc d = {0};
+    gsd_field *field;
+    d.forest_cells = cells;
+    d.max_depth = max_depth;
+    d.alias = alias;
+    d.simd = simd;
+    d.max_bytes = (uint64_t)1 << 32;
+    OK(gsd_create(&d, &field));
+    gsd_tree *trees = calloc(cells, sizeof *trees);
+    for (uint32_t c = 0; c < cells; ++c)
+        trees[c] = random_tree(c, inner, max_depth);
+    OK(gsd_import_trees(field, trees, cells));
+    for (uint32_t c = 0; c < cells; ++c)
+        free_tree(&trees[c]);
+    free(trees);
+    OK(gsd_validate(field));
+    return field;
+}
+
+/* Naive double-precision lookup in an exported tree: probability and solid angle of the leaf of (x, y) in [0,1)^2. */
+static void naive_leaf(const gsd_tree *t, double x, double y, double *probability, double *area, uint32_t *id)
+{
+    uint32_t node = 0;
+    *area = 4 * PI;
+    for (;;) {
+        int bx = x >= 0.5, by = y >= 0.5;
+        x = 2 * x - bx;
+        y = 2 * y - by;
+        *area /= 4;
+        uint32_t k = node * 4 + (uint32_t)(bx + 2 * by);
+        if (t->child[k] == 0) {
+            *probability = (double)t->value[k];
+            *id = k;
+            return;
+        }
+        node = t->child[k];
+    }
+}
+
+static void naive_coordinates(const float d[3], double *x, double *y)
+{
+    double phi = atan2((double)d[1], (double)d[0]) / (2 * PI);
+    *x = phi < 0 ? phi + 1 : phi;
+    *x = *x >= 1 ? 0 : *x;
+    *y = ((double)d[2] + 1) / 2;
+    *y = *y < 0 ? 0 : *y > 1 - 1e-12 ? 1 - 1e-12 : *y;
+}
+
+static gsd_tree export(const gsd_field *f, gsd_part part, uint32_t cell)
+{
+    gsd_tree t = {cell, gsd_export_bound(f, part, cell), NULL, NULL};
+    t.child = calloc(t.count * 4, sizeof *t.child);
+    t.value = calloc(t.count * 4, sizeof *t.value);
+    OK(gsd_export_tree(f, part, &t));
+    return t;
+}
+
+static double naive_pdf(const gsd_tree *t, double e, const float d[3])
+{
+    double x, y, p, area;
+    uint32_t id;
+    naive_coordinates(d, &x, &y);
+    naive_leaf(t, x, y, &p, &area, &id);
+    return (1 - e) * p / area + e / (4 * PI);
+}
+
+/* ---- options */
+
+/* Every "default N" in the comments of gsd_desc is what gsd_resolve gives. */
+static void test_documented_defaults_are_the_defaults(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_DEFAULT);
+    OK(gsd_resolve(&d, &d));
+    const struct {
+        const char *name;
+        double value;
+    } fields[] = {{"switch_pass", d.switch_pass}, {"split_samples", (double)d.split_samples}, {"rho", (double)d.rho},
+                  {"max_depth", d.max_depth}, {"max_levels", d.max_levels}, {"min_samples", d.min_samples},
+                  {"max_bytes", (double)d.max_bytes}, {"alpha", (double)d.alpha}, {"uniform", (double)d.uniform},
+                  {"gate_margin", (double)d.gate_margin}, {"gate_probe", d.gate_probe}};
+    FILE *f = fopen("guide_sdtree.h", "r");
+    f = f ? f : fopen("../guide_sdtree.h", "r");
+    assert_non_null(f);
+    char line[512];
+    unsigned seen = 0;
+    bool inside = false;
+    while (fgets(line, sizeof line, f)) {
+        inside = inside || strstr(line, "typedef struct gsd_desc");
+        if (strstr(line, "} gsd_desc;"))
+            break;
+        for (unsigned i = 0; inside && i < sizeof fields / sizeof *fields; ++i) {
+            char key[64];
+            snprintf(key, sizeof key, " %s;", fields[i].name);
+            const char *at = strstr(line, key), *text = at ? strstr(at, "default ") : NULL;
+            if (!text)
+                continue;
+            double value, exponent;
+            int n = sscanf(text, "default %lf^%lf", &value, &exponent);
+            assert_true(n >= 1);
+            value = n == 2 ? pow(value, exponent) : value;
+            assert_true(fabs(value - fields[i].value) <= 1e-6 * value);
+            seen++;
+        }
+    }
+    fclose(f);
+    assert_int_equal(seen, sizeof fields / sizeof *fields);
+    assert_int_equal(d.target, GSD_TARGET_SWITCHING);
+    assert_int_equal(d.spatial_filter, GSD_SPATIAL_NEAREST);
+    assert_int_equal(d.directional_filter, GSD_DIRECTIONAL_BOX);
+    assert_int_equal(d.alpha_mode, GSD_ALPHA_GRID);
+}
+
+static void test_bad_descriptors_are_refused_by_name(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE), r;
+    gsd_field *field = (gsd_field *)&d;
+    memset(&d, 0, sizeof d);
+    assert_int_equal(gsd_create(&d, &field), GSD_BAD_BOUNDS);
+    assert_null(field);
+    d = unit_cube(GSD_TARGET_RADIANCE);
+    d.bounds_max[1] = NAN;
+    assert_int_equal(gsd_resolve(&d, &r), GSD_BAD_BOUNDS);
+    d = unit_cube((gsd_target)17);
+    assert_int_equal(gsd_resolve(&d, &r), GSD_BAD_OPTION);
+    d = unit_cube(GSD_TARGET_RADIANCE);
+    d.rho = NAN;
+    assert_int_equal(gsd_resolve(&d, &r), GSD_BAD_RANGE);
+    d = unit_cube(GSD_TARGET_RADIANCE);
+    d.max_depth = 21;
+    assert_int_equal(gsd_resolve(&d, &r), GSD_BAD_RANGE);
+    d = unit_cube(GSD_TARGET_RADIANCE);
+    d.allocate = count_allocate;
+    assert_int_equal(gsd_resolve(&d, &r), GSD_BAD_ALLOCATOR);
+    for (int i = 0; i <= GSD_RESULT_COUNT; ++i)
+        assert_true(strlen(gsd_result_string((gsd_result)i)) > 1);
+    assert_non_null(strstr(gsd_result_string(GSD_BAD_BOUNDS), "bounds_min"));
+}
+
+static void test_sizes_are_as_documented(void **state)
+{
+    (void)state;
+    assert_int_equal(sizeof(gsd_node), 16);
+    assert_int_equal(sizeof(gsd_alias), 12);
+    assert_int_equal(sizeof(gsd_cell), 32);
+    assert_int_equal(sizeof(gsd_handle), 24);
+    assert_int_equal(sizeof(gsd_training_sample), 48);
+    assert_int_equal(sizeof(gsdi_tree), 32);
+    assert_true(sizeof(gsdi_state) < 600);
+    /* bytes of a field: 16 a node in the sampling part, 12 in the building part */
+    gsd_field *few = forest_of(1, 40, 16, false, GSD_SIMD_AUTO), *many = forest_of(1, 1040, 16, false, GSD_SIMD_AUTO);
+    gsd_stats a, b;
+    gsd_get_stats(few, &a);
+    gsd_get_stats(many, &b);
+    assert_int_equal(b.nodes - a.nodes, 4000);
+    assert_int_equal(b.bytes - a.bytes, 16 * 4000);
+    gsd_destroy(few);
+    gsd_destroy(many);
+}
+
+/* ---- distributions */
+
+static void test_pdf_integrates_to_one(void **state)
+{
+    (void)state;
+    const uint32_t depths[] = {1, 2, 5, 9, 16, 20};
+    for (unsigned i = 0; i < 6; ++i)
+        for (unsigned round = 0; round < 8; ++round) {
+            seed(100 * i + round);
+            uint32_t inner = depths[i] < 3 ? 1 + depths[i] : 20 + 300 * round;
+            gsd_field *f = forest_of(1, inner, depths[i], false, GSD_SIMD_AUTO);
+            gsd_view v = gsd_get_view(f);
+            gsd_handle h = gsd_find_cell(&v, 0);
+            double total = 0, low = 1, quadrature = 0;
+            const gsdi_tree *t = &gsdi_trees(f->block)[gsdi_cells(f->block)[0].tree];
+            for (uint32_t k = 0; k < t->groups * 4; ++k) {
+                const gsd_node *n = &v.nodes[t->first + k];
+                if (n->leaf.child == 0) {
+                    total += (double)n->leaf.pdf * 4 * PI * pow(0.25, n->leaf.x >> 24);
+                    low = fmin(low, (double)n->leaf.pdf);
+                }
+            }
+            assert_true(fabs(total - 1) < 1e-5);
+            assert_true(low >= 0.0099 / (4 * PI));
+            for (int y = 0; depths[i] <= 9 && y < 512; ++y)
+                for (int x = 0; x < 512; ++x) { /* midpoints of depth 9: exact for these trees */
+                    double z = (y + 0.5) / 256 - 1, phi = 2 * PI * (x + 0.5) / 512, r = sqrt(1 - z * z);
+                    float d[3] = {(float)(r * cos(phi)), (float)(r * sin(phi)), (float)z};
+                    quadrature += (double)gsd_pdf(&v, &h, d) * 4 * PI / (512 * 512);
+                }
+            assert_true(depths[i] > 9 || fabs(quadrature - 1) < 1e-5);
+            gsd_destroy(f);
+        }
+}
+
+/* Upper tail of chi-square as a normal deviate (Wilson and Hilferty). */
+static double chi_square_deviate(double chi2, double df)
+{
+    return (cbrt(chi2 / df) - (1 - 2 / (9 * df))) / sqrt(2 / (9 * df));
+}
+
+static void chi_square_of(bool alias, uint32_t depth, uint64_t s)
+{
+    seed(s);
+    gsd_field *f = forest_of(1, 60, depth, alias, GSD_SIMD_AUTO);
+    gsd_view v = gsd_get_view(f);
+    gsd_handle h = gsd_find_cell(&v, 0);
+    gsd_tree t = export(f, GSD_PART_SAMPLING, 0);
+    double *expected = calloc(t.count * 4, sizeof *expected), rest = 0, rest_seen = 0, chi2 = 0, df = -1;
+    long *seen = calloc(t.count * 4, sizeof *seen), n = scaled(1000000);
+    uint32_t *depths = calloc(t.count, sizeof *depths);
+    for (uint32_t i = 0; i < t.count; ++i)
+        for (uint32_t k = 0; k < 4; ++k) {
+            uint32_t c = t.child[i * 4 + k];
+            if (c)
+                depths[c] = depths[i] + 1;
+            else
+                expected[i * 4 + k] = (double)n * (0.99 * (double)t.value[i * 4 + k] + 0.01 * pow(0.25, depths[i] + 1));
+        }
+    for (long i = 0; i < n; ++i) {
+        float u[2] = {rndf(), rndf()}, d[3];
+        double x, y, p, area;
+        uint32_t id;
+        gsd_sample(&v, &h, u, d);
+        naive_coordinates(d, &x, &y);
+        naive_leaf(&t, x, y, &p, &area, &id);
+        seen[id]++;
+    }
+    for (uint32_t i = 0; i < t.count * 4; ++i) {
+        if (expected[i] <= 0)
+            continue;
+        if (expected[i] < 20) {
+            rest += expected[i];
+            rest_seen += (double)seen[i];
+            continue;
+        }
+        chi2 += ((double)seen[i] - expected[i]) * ((double)seen[i] - expected[i]) / expected[i];
+        df += 1;
+    }
+    if (rest > 5) {
+        chi2 += (rest_seen - rest) * (rest_seen - rest) / rest;
+        df += 1;
+    }
+    if (chi_square_deviate(chi2, df) > 4)
+        fail_msg("chi-square %g at %g degrees of freedom (alias %d)", chi2, df, alias);
+    free(expected);
+    free(seen);
+    free(depths);
+    free_tree(&t);
+    gsd_destroy(f);
+}
+
+static void test_samples_follow_the_density(void **state)
+{
+    (void)state;
+    for (uint64_t s = 0; s < 3; ++s)
+        chi_square_of(false, 12, 7 + s);
+}
+
+static void test_alias_samples_follow_the_density(void **state)
+{
+    (void)state;
+    for (uint64_t s = 0; s < 3; ++s)
+        chi_square_of(true, 12, 7 + s);
+}
+
+/* Within one leaf samples are uniform: chi-square on 16 x 16 of the one leaf that holds everything. */
+static void test_samples_are_uniform_within_a_leaf(void **state)
+{
+    (void)state;
+    for (int alias = 0; alias < 2; ++alias) {
+        uint32_t child[8] = {0, 1, 0, 0, 0, 0, 0, 0};
+        float value[8] = {0, 0, 0, 0, 0, 0, 1, 0};
+        gsd_tree t = {0, 2, child, value};
+        gsd_desc d = {.forest_cells = 1, .alias = alias, .uniform = 1e-4f};
+        gsd_field *f;
+        OK(gsd_create(&d, &f));
+        OK(gsd_import_trees(f, &t, 1));
+        gsd_view v = gsd_get_view(f);
+        gsd_handle h = gsd_find_cell(&v, 0);
+        static long seen[256];
+        memset(seen, 0, sizeof seen);
+        long n = 0;
+        double chi2 = 0;
+        for (int i = 0; i < 400000; ++i) {
+            float u[2] = {rndf(), rndf()}, dir[3];
+            double x, y;
+            gsd_sample(&v, &h, u, dir);
+            naive_coordinates(dir, &x, &y);
+            x = (x - 0.5) * 4;
+            y = (y - 0.25) * 4;
+            if (x < 0 || x >= 1 || y < 0 || y >= 1)
+                continue;
+            seen[(int)(x * 16) + 16 * (int)(y * 16)]++;
+            n++;
+        }
+        assert_true(n > 399000);
+        for (int i = 0; i < 256; ++i)
+            chi2 += pow((double)seen[i] - n / 256.0, 2) / (n / 256.0);
+        assert_true(chi_square_deviate(chi2, 255) < 4);
+        gsd_destroy(f);
+    }
+}
+
+/* The pdf that sample returns is that of the rounded direction, exactly; it agrees with a double-precision lookup except
+   where rounding moved the direction across a leaf's edge, which is rare. */
+static void test_sample_and_pdf_agree(void **state)
+{
+    (void)state;
+    for (int alias = 0; alias < 2; ++alias)
+        for (uint32_t depth = 12; depth <= 20; depth += 8) {
+            seed(depth);
+            gsd_field *f = forest_of(1, 400, depth, alias, GSD_SIMD_AUTO);
+            gsd_view v = gsd_get_view(f);
+            gsd_handle h = gsd_find_cell(&v, 0);
+            gsd_tree t = export(f, GSD_PART_SAMPLING, 0);
+            long n = scaled(400000), other = 0;
+            for (long i = 0; i < n; ++i) {
+                float u[2] = {rndf(), rndf()}, d[3];
+                float pdf = gsd_sample(&v, &h, u, d);
+                assert_true(pdf == gsd_pdf(&v, &h, d));
+                assert_true(fabs((double)d[0] * (double)d[0] + (double)d[1] * (double)d[1] +
+                                 (double)d[2] * (double)d[2] - 1) < 1e-6);
+                double naive = naive_pdf(&t, 0.01, d);
+                other += fabs((double)pdf - naive) > 1e-4 * naive + 1e-5;
+            }
+            assert_true((double)other / (double)n < (depth == 20 ? 0.05 : 0.001));
+            free_tree(&t);
+            gsd_destroy(f);
+        }
+}
+
+/* Estimating a known integral by sampling is unbiased, whatever the tree. */
+static void test_estimates_with_the_density_are_unbiased(void **state)
+{
+    (void)state;
+    seed(5);
+    gsd_field *f = forest_of(1, 100, 10, false, GSD_SIMD_AUTO);
+    gsd_view v = gsd_get_view(f);
+    gsd_handle h = gsd_find_cell(&v, 0);
+    double sum = 0, square = 0;
+    long n = scaled(400000);
+    for (long i = 0; i < n; ++i) {
+        float u[2] = {rndf(), rndf()}, d[3];
+        float pdf = gsd_sample(&v, &h, u, d);
+        double x = (1 + 0.5 * (double)d[0] + (double)(d[1] * d[2])) / (double)pdf; /* integral 4 pi */
+        sum += x;
+        square += x * x;
+    }
+    double mean = sum / (double)n, error = sqrt((square / (double)n - mean * mean) / (double)n);
+    assert_true(fabs(mean - 4 * PI) < 4.5 * error);
+    gsd_destroy(f);
+}
+
+static void test_seam_poles_and_odd_directions(void **state)
+{
+    (void)state;
+    const float d[][3] = {{1, 0, 0}, {1, -0.0f, 0}, {-1, 0, 0}, {-1, -0.0f, 0}, {0, 1, 0}, {0, -1, 0}, {0, 0, 1},
+                          {0, 0, -1}, {-0.0f, -0.0f, 1}, {1, -1e-30f, 0}, {1, 1e-30f, 0}, {0, 0, 1.0001f}};
+    const double x[] = {0, 0, 0.5, 0.5, 0.25, 0.75, 0, 0, 0, 1, 0, 0};
+    for (unsigned i = 0; i < sizeof d / sizeof *d; ++i) {
+        uint32_t cx, cy;
+        gsd_coordinates(d[i], &cx, &cy);
+        assert_true(fabs(cx / 16777216.0 - x[i]) < 2e-7);
+        assert_true(cx < 16777216 && cy < 16777216);
+    }
+    float odd[4][3] = {{NAN, 0, 0}, {0, NAN, NAN}, {INFINITY, INFINITY, 0}, {0, 0, 0}};
+    for (unsigned i = 0; i < 4; ++i) {
+        uint32_t cx, cy;
+        gsd_coordinates(odd[i], &cx, &cy);
+        assert_true(cx < 16777216 && cy < 16777216);
+    }
+    double worst = 0;
+    for (int i = 0; i < 1000000; ++i) {
+        float dir[3];
+        uint32_t cx, cy;
+        double nx, ny;
+        random_direction(dir);
+        gsd_coordinates(dir, &cx, &cy);
+        naive_coordinates(dir, &nx, &ny);
+        double e = fabs((cx + 0.5) / 16777216.0 - nx);
+        e = fmin(e, 1 - e);
+        worst = fmax(worst, fmax(e, fabs((cy + 0.5) / 16777216.0 - ny)));
+    }
+    assert_true(worst < 1.5 / 16777216.0);
+}
+
+/* ---- batches */
+
+static void test_batches_equal_single_queries_at_every_level(void **state)
+{
+    (void)state;
+    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_AVX512; ++level)
+        for (int alias = 0; alias < 2; ++alias) {
+            enum { N = 1003 };
+            gsd_desc probe = unit_cube(GSD_TARGET_RADIANCE), resolved;
+            probe.simd = (gsd_simd)level;
+            if (gsd_resolve(&probe, &resolved) != GSD_OK)
+                continue; /* this machine lacks it */
+            seed((uint64_t)level);
+            gsd_field *f = forest_of(40, 75, 16, alias, (gsd_simd)level);
+            gsd_view v = gsd_get_view(f);
+            static gsd_handle handles[N];
+            static float u[N][2], dir[N][4], pdf[N], in[N][3];
+            static uint32_t index[N];
+            uint32_t n = 0;
+            long apart = 0;
+            for (uint32_t i = 0; i < N; ++i) {
+                handles[i] = gsd_find_cell(&v, i % 43); /* 40 .. 42: no such cell: uniform */
+                u[i][0] = i == 5 ? 0 : i == 6 ? 0x1.fffffep-1f : rndf();
+                u[i][1] = i == 7 ? 0 : i == 6 ? 0x1.fffffep-1f : rndf();
+                random_direction(in[i]);
+                pdf[i] = -1;
+                if (i % 3)
+                    index[n++] = N - 1 - i;
+            }
+            gsd_sample_batch(&v, n, index, handles, u[0], sizeof u[0], dir[0], sizeof dir[0], pdf);
+            for (uint32_t k = 0; k < n; ++k) {
+                uint32_t i = index[k];
+                float d[3], p = gsd_sample(&v, &handles[i], u[i], d);
+                double away = fabs((double)(d[0] - dir[i][0])) + fabs((double)(d[1] - dir[i][1])) +
+                              fabs((double)(d[2] - dir[i][2]));
+                apart += fabsf(p - pdf[i]) > 2e-6f * p || away > 2e-6;
+            }
+            assert_true(apart <= 1);
+            for (uint32_t i = 0; i < N; i += 3) /* not in the list: untouched */
+                assert_true(pdf[N - 1 - i] == -1);
+            gsd_pdf_batch(&v, N, NULL, handles, in[0], sizeof in[0], pdf);
+            apart = 0;
+            for (uint32_t i = 0; i < N; ++i)
+                apart += fabsf(gsd_pdf(&v, &handles[i], in[i]) - pdf[i]) > 2e-6f * pdf[i];
+            assert_true(apart <= 1);
+            gsd_destroy(f);
+        }
+}
+
+/* ---- learning */
+
+static float scene_radiance(const float p[3], const float d[3])
+{
+    return d[0] > 0.9f ? 40 * (0.2f + p[1]) : d[2] > 0.5f ? 0.5f : 0.1f;
+}
+
+/* n samples drawn from the field, as a renderer would; every 7th is black. */
+static void make_samples(const gsd_view *v, gsd_training_sample *s, uint32_t n)
+{
+    for (uint32_t i = 0; i < n; ++i) {
+        float p[3] = {rndf(), rndf(), rndf()}, d[3], u[2] = {rndf(), rndf()};
+        gsd_handle h = gsd_find(v, p, NULL);
+        float pg = gsd_sample(v, &h, u, d), pb = (float)(0.25 / PI);
+        if (rnd() < (double)h.alpha) {
+            random_direction(d);
+            pg = gsd_pdf(v, &h, d);
+        }
+        float mix = h.alpha * pb + (1 - h.alpha) * pg;
+        float L = i % 7 ? scene_radiance(p, d) : 0;
+        s[i] = gsd_make_scalar_sample(p, d, L, L * 0.3f, L * 0.3f * (0.5f + p[0]), mix, pb, pg);
+    }
+}
+
+static void learn(gsd_field *f, const gsd_training_sample *s, uint32_t n)
+{
+    gsd_stream *stream;
+    OK(gsd_stream_create(f, &stream));
+    OK(gsd_record(stream, s, n));
+    OK(gsd_accumulate(f, &stream, 1, NULL, NULL));
+    gsd_stream_destroy(stream);
+}
+
+static gsd_field *train(const gsd_desc *d, int passes, uint32_t first)
+{
+    gsd_field *f;
+    OK(gsd_create(d, &f));
+    for (int p = 0; p < passes; ++p) {
+        uint32_t n = first << p;
+        gsd_training_sample *s = malloc(n * sizeof *s);
+        gsd_view v = gsd_get_view(f);
+        make_samples(&v, s, n);
+        learn(f, s, n);
+        OK(gsd_refine(f, NULL, NULL, NULL));
+        OK(gsd_validate(f));
+        free(s);
+    }
+    return f;
+}
+
+static void *save(const gsd_field *f, size_t *size)
+{
+    size_t bound = gsd_save_bound(f);
+    void *p = malloc(bound);
+    OK(gsd_save(f, p, bound, size));
+    assert_true(*size <= bound);
+    return p;
+}
+
+static bool same_fields(const gsd_field *a, const gsd_field *b)
+{
+    size_t na, nb;
+    void *pa = save(a, &na), *pb = save(b, &nb);
+    bool same = na == nb && memcmp(pa, pb, na) == 0;
+    free(pa);
+    free(pb);
+    return same;
+}
+
+/* The same samples, whatever the threads and the cuts into streams and calls, give the same bits. */
+static void test_results_do_not_depend_on_threads_or_cuts(void **state)
+{
+    (void)state;
+    enum { N = 60000 };
+    gsd_training_sample *s = malloc(N * sizeof *s);
+    for (int variant = 0; variant < 3; ++variant) {
+        gsd_field *fields[5];
+        gsd_desc d = unit_cube(variant == 0 ? GSD_TARGET_RADIANCE : GSD_TARGET_SIMPLE);
+        d.split_samples = 500;
+        d.spatial_filter = variant == 2 ? GSD_SPATIAL_STOCHASTIC : GSD_SPATIAL_NEAREST;
+        d.alpha_mode = variant == 0 ? GSD_ALPHA_ADAM : GSD_ALPHA_GRID;
+        for (int k = 0; k < 5; ++k)
+            OK(gsd_create(&d, &fields[k]));
+        for (int pass = 0; pass < 3; ++pass) {
+            seed((uint64_t)pass);
+            gsd_view v = gsd_get_view(fields[0]);
+            make_samples(&v, s, N);
+            for (int k = 0; k < 5; ++k) { /* 1, 2, 3, 4, 7 threads; k + 1 streams; k + 1 calls */
+                crowd team = {k == 4 ? 7 : k + 1};
+                gsd_stream *streams[5];
+                uint32_t at = 0;
+                for (int i = 0; i <= k; ++i)
+                    OK(gsd_stream_create(fields[k], &streams[i]));
+                for (int call = 0; call <= k; ++call) {
+                    for (int i = 0; i <= k; ++i) {
+                        uint32_t end = (uint32_t)((uint64_t)N * (uint64_t)(call * (k + 1) + i + 1) /
+                                                  (uint64_t)((k + 1) * (k + 1)));
+                        gsd_stream_clear(streams[i]);
+                        OK(gsd_record(streams[i], s + at, end - at));
+                        assert_int_equal(gsd_stream_size(streams[i]), end - at);
+                        at = end;
+                    }
+                    OK(gsd_accumulate(fields[k], streams, (uint32_t)k + 1, k ? crowd_for : NULL, &team));
+                }
+                assert_int_equal(at, N);
+                for (int i = 0; i <= k; ++i)
+                    gsd_stream_destroy(streams[i]);
+                OK(gsd_refine(fields[k], NULL, k ? crowd_for : NULL, &team));
+            }
+            for (int k = 1; k < 5; ++k)
+                assert_true(same_fields(fields[0], fields[k]));
+        }
+        assert_true(gsd_cell_count(fields[0]) > 8);
+        for (int k = 0; k < 5; ++k)
+            gsd_destroy(fields[k]);
+    }
+    free(s);
+}
+
+/* Leaf densities of every target against sums made in double precision by the formulas of the papers. */
+static void test_targets_match_a_naive_reference(void **state)
+{
+    (void)state;
+    enum { N = 20000 };
+    for (int target = GSD_TARGET_RADIANCE; target <= GSD_TARGET_SWITCHING; ++target) {
+        seed((uint64_t)target);
+        gsd_desc d = unit_cube((gsd_target)target);
+        gsd_field *f;
+        static gsd_training_sample s[N];
+        static double sum[2048];
+        d.directional_filter = GSD_DIRECTIONAL_NEAREST;
+        d.split_samples = 1e9f;
+        d.switch_pass = 2;
+        d.no_history = true;
+        d.alpha_mode = GSD_ALPHA_FIXED;
+        d.no_gate = true;
+        OK(gsd_create(&d, &f));
+        for (int pass = 0; pass < 4; ++pass) {
+            gsd_view v = gsd_get_view(f);
+            gsd_tree t = export(f, GSD_PART_BUILDING, 0), now;
+            uint32_t depth[512] = {0};
+            double total = 0, area, p, x, y, e = 0.01;
+            uint32_t id;
+            assert_true(t.count <= 512);
+            memset(sum, 0, sizeof sum);
+            make_samples(&v, s, N);
+            for (int i = 0; i < N; ++i) {
+                double alpha = 0.5, pb = (double)s[i].pdf_bsdf, pg = (double)s[i].pdf_guide;
+                double w = (1 - alpha) * pg / (alpha * pb + (1 - alpha) * pg), value;
+                bool variance = target == GSD_TARGET_VARIANCE || (target == GSD_TARGET_SWITCHING && pass >= 2);
+                value = (double)(variance ? s[i].pixel_contribution : s[i].contribution) * w;
+                value = target == GSD_TARGET_RADIANCE ? (double)s[i].radiance : value * value;
+                naive_coordinates(s[i].direction, &x, &y);
+                naive_leaf(&t, x, y, &p, &area, &id);
+                sum[id] += value / (double)s[i].pdf_mix;
+            }
+            learn(f, s, N);
+            OK(gsd_refine(f, NULL, NULL, NULL));
+            now = export(f, GSD_PART_SAMPLING, 0);
+            assert_int_equal(now.count, t.count);
+            for (uint32_t i = 0; i < t.count; ++i) /* the two may number their nodes differently */
+                for (uint32_t k = 0; k < 4; ++k) {
+                    uint32_t c = t.child[i * 4 + k];
+                    if (c)
+                        depth[c] = depth[i] + 1;
+                    else if (target != GSD_TARGET_RADIANCE)
+                        sum[i * 4 + k] = sqrt(sum[i * 4 + k] * pow(0.25, depth[i] + 1));
+                    total += c ? 0 : sum[i * 4 + k];
+                }
+            v = gsd_get_view(f);
+            gsd_handle h = gsd_find_cell(&v, 0);
+            long far = 0;
+            for (int i = 0; i < 2000; ++i) { /* by direction */
+                naive_coordinates(s[i].direction, &x, &y);
+                naive_leaf(&now, x, y, &p, &area, &id);
+                double naive = (1 - e) * p / area + e / (4 * PI);
+                far += fabs((double)gsd_pdf(&v, &h, s[i].direction) - naive) > 2e-5 * naive;
+                /* p itself, from the naive sums in the structure of the building tree */
+                double q;
+                naive_leaf(&t, x, y, &q, &area, &id);
+                far += fabs(p - sum[id] / total) > 3e-5 * p + 1e-7;
+            }
+            assert_true(far <= 4);
+            free_tree(&t);
+            free_tree(&now);
+        }
+        gsd_destroy(f);
+    }
+}
+
+/* The box filter against a brute-force one: overlap of a box of the leaf's size, unfolded over seam and poles. */
+static void test_box_filter_matches_brute_force(void **state)
+{
+    (void)state;
+    for (int round = 0; round < 40; ++round) {
+        seed((uint64_t)round + 50);
+        gsd_tree t = random_tree(0, 30, 6);
+        uint32_t child[400], x = (uint32_t)(rng_next() & 0xffffff), y = (uint32_t)(rng_next() & 0xffffff), depth;
+        double mass[400], sum[400] = {0}, expected[64][64] = {{0}};
+        unsigned char scratch[100];
+        x = round % 5 == 0 ? (uint32_t)round : round % 5 == 1 ? 16777215u - (uint32_t)round : x;
+        y = round % 3 == 0 ? (uint32_t)round * 3 : round % 3 == 1 ? 16777215u - (uint32_t)round * 7 : y;
+        assert_true(gsdi_import_convert(&t, 16, child, mass, scratch) >= 0);
+        gsdi_building_leaf(child, x, y, &depth);
+        gsdi_splat_box(child, sum, x, y, 3.0);
+        /* expected mass of a 64 x 64 grid: integrate the box with 512 x 512 points at odd sub-steps */
+        double size = pow(0.5, depth);
+        for (int j = 0; j < 512; ++j)
+            for (int i = 0; i < 512; ++i) {
+                double bx = x / 16777216.0 + ((i + 0.5) / 512 - 0.5) * size;
+                double by = y / 16777216.0 + ((j + 0.5) / 512 - 0.5) * size;
+                if (by < 0 || by >= 1) {
+                    by = by < 0 ? -by : 2 - by;
+                    bx += 0.5;
+                }
+                bx -= floor(bx);
+                by = by >= 1 ? 1 - 1e-9 : by;
+                expected[(int)(by * 64)][(int)(bx * 64)] += 3.0 / (512 * 512);
+            }
+        double total = 0;
+        struct {
+            uint32_t node;
+            int x, y, n;
+        } stack[64] = {{0, 0, 0, 64}};
+        for (int top = 0; top >= 0;) {
+            uint32_t node = stack[top].node;
+            int x0 = stack[top].x, y0 = stack[top].y, n = stack[top].n;
+            --top;
+            if (child[node]) {
+                for (int k = 0; k < 4; ++k) {
+                    ++top;
+                    stack[top].node = child[node] + (uint32_t)k;
+                    stack[top].x = x0 + (k & 1) * n / 2;
+                    stack[top].y = y0 + (k >> 1) * n / 2;
+                    stack[top].n = n / 2;
+                }
+                continue;
+            }
+            double brute = 0;
+            for (int j = y0; j < y0 + n; ++j)
+                for (int i = x0; i < x0 + n; ++i)
+                    brute += expected[j][i];
+            assert_true(fabs(brute - sum[node]) < 0.02);
+            total += sum[node];
+        }
+        assert_true(fabs(total - 3) < 1e-9);
+        free_tree(&t);
+    }
+}
+
+static void test_trees_refine_where_the_mass_is(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    seed(3);
+    gsd_field *f = train(&d, 5, 4000);
+    gsd_tree t = export(f, GSD_PART_SAMPLING, 0);
+    for (uint32_t i = 0; i < t.count; ++i) /* building structure of a pass: no leaf far above rho, no node far below */
+        for (uint32_t k = 0; k < 4; ++k)
+            assert_true(t.child[i * 4 + k] || (double)t.value[i * 4 + k] < 0.04);
+    free_tree(&t);
+    /* light from +x is found: most samples go there */
+    gsd_view v = gsd_get_view(f);
+    long hits = 0;
+    for (int i = 0; i < 20000; ++i) {
+        float p[3] = {rndf(), rndf(), rndf()}, u[2] = {rndf(), rndf()}, dir[3];
+        gsd_handle h = gsd_find(&v, p, NULL);
+        gsd_sample(&v, &h, u, dir);
+        hits += dir[0] > 0.9f;
+    }
+    assert_true(hits > 14000); /* 5 % of the sphere, 86 % of the light */
+    gsd_destroy(f);
+}
+
+/* ---- space */
+
+/* Naive lookup: walk the spatial tree with positions in double precision. */
+static uint32_t naive_cell(const gsd_view *v, const float p[3])
+{
+    double t[3];
+    uint32_t link = v->spatial[0];
+    for (int i = 0; i < 3; ++i)
+        t[i] = ((double)p[i] - (double)v->origin[i]) * (double)v->scale / 16777216.0;
+    for (int level = 0; !(link & GSD_CELL_BIT); ++level) {
+        double *x = &t[level % 3];
+        *x *= 2;
+        link = v->spatial[link + (*x >= 1 ? 1 : 0)];
+        *x -= *x >= 1 ? 1 : 0;
+    }
+    return link & ~GSD_CELL_BIT;
+}
+
+static void test_cells_split_where_samples_are(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    d.split_samples = 100;
+    gsd_field *f;
+    OK(gsd_create(&d, &f));
+    static gsd_training_sample s[20000];
+    for (int pass = 0; pass < 4; ++pass) {
+        gsd_view v = gsd_get_view(f);
+        seed((uint64_t)pass);
+        make_samples(&v, s, 20000);
+        for (int i = 0; i < 20000; ++i) /* all in a slab near x = 0.3, half of them in one corner of it */
+            for (int k = 0; k < 3; ++k)
+                s[i].position[k] = k == 0 ? 0.3f : i & 1 ? 0.05f * s[i].position[k] : s[i].position[k];
+        learn(f, s, 20000);
+        OK(gsd_refine(f, NULL, NULL, NULL));
+        OK(gsd_validate(f));
+    }
+    gsd_view v = gsd_get_view(f);
+    static uint32_t counts[100000];
+    long far = 0;
+    assert_true(v.cell_count > 200 && v.cell_count < 2000);
+    for (int i = 0; i < 20000; ++i) {
+        gsd_handle h = gsd_find(&v, s[i].position, NULL);
+        far += h.cell != naive_cell(&v, s[i].position);
+        counts[h.cell]++;
+    }
+    assert_true(far < 20);
+    for (uint32_t c = 0; c < v.cell_count; ++c)
+        assert_true(counts[c] < 400);
+    /* outside positions are clamped into the box, with u too */
+    float outside[3] = {-1e30f, 1e30f, NAN}, u[3] = {0, 0.99f, 0.5f};
+    assert_true(gsd_find(&v, outside, NULL).cell < v.cell_count);
+    assert_true(gsd_find(&v, outside, u).cell < v.cell_count);
+    /* batch */
+    static gsd_handle handles[20000];
+    static float alpha[20000];
+    gsd_find_batch(&v, 20000, NULL, s[0].position, sizeof s[0], NULL, 0, handles, alpha);
+    for (int i = 0; i < 20000; ++i) {
+        gsd_handle h = gsd_find(&v, s[i].position, NULL);
+        assert_memory_equal(&h, &handles[i], sizeof h);
+        assert_true(alpha[i] == h.alpha);
+    }
+    gsd_destroy(f);
+}
+
+/* A wall of no thickness, lit from one side: directions towards the lamp are preferred, those through it are not lost. */
+static void test_thin_wall_lit_from_one_side(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    gsd_field *f;
+    OK(gsd_create(&d, &f));
+    static gsd_training_sample s[30000];
+    for (int pass = 0; pass < 3; ++pass) {
+        gsd_view v = gsd_get_view(f);
+        seed((uint64_t)pass);
+        make_samples(&v, s, 30000);
+        for (int i = 0; i < 30000; ++i) { /* points on z = 0.5, both sides; light only from above */
+            s[i].position[2] = 0.5f;
+            s[i].radiance = s[i].direction[2] > 0 ? 1 : 0;
+        }
+        learn(f, s, 30000);
+        OK(gsd_refine(f, NULL, NULL, NULL));
+    }
+    gsd_view v = gsd_get_view(f);
+    float p[3] = {0.4f, 0.6f, 0.5f}, down[3] = {0.1f, 0.1f, -0.9899495f}, up = 0;
+    gsd_handle h = gsd_find(&v, p, NULL);
+    for (int i = 0; i < 10000; ++i) {
+        float dir[3];
+        random_direction(dir);
+        dir[2] = fabsf(dir[2]);
+        up += gsd_pdf(&v, &h, dir) * (float)(2 * PI) / 10000;
+    }
+    assert_true(up > 0.9f && up < 0.996f);
+    assert_true(gsd_pdf(&v, &h, down) > 0 && gsd_pdf(&v, &h, down) < 0.02f);
+    gsd_destroy(f);
+}
+
+/* ---- bad input */
+
+static void test_bad_samples_are_refused_and_leave_no_trace(void **state)
+{
+    (void)state;
+    enum { N = 40000 };
+    static gsd_training_sample clean[N], dirty[N + N / 100];
+    const float bad[] = {NAN, INFINITY, -INFINITY, -1, 1e30f, 3e38f};
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    for (int target = GSD_TARGET_RADIANCE; target <= GSD_TARGET_VARIANCE; ++target) {
+        gsd_field *a, *b;
+        uint32_t total = 0;
+        d.target = (gsd_target)target;
+        d.split_samples = 2000;
+        OK(gsd_create(&d, &a));
+        OK(gsd_create(&d, &b));
+        for (int pass = 0; pass < 3; ++pass) {
+            gsd_view v = gsd_get_view(a);
+            uint32_t m = 0;
+            seed((uint64_t)pass + 9);
+            make_samples(&v, clean, N);
+            for (int i = 0; i < N; ++i) {
+                dirty[m++] = clean[i];
+                if (i % 100)
+                    continue;
+                gsd_training_sample s = clean[(i + 77) % N];
+                float x = bad[(i / 100) % 6];
+                switch ((i / 100) % 11) {
+                case 0: s.radiance = x; break;
+                case 1: s.contribution = x; break;
+                case 2: s.pixel_contribution = x; break;
+                case 3: s.pdf_mix = isfinite(x) && x > 0 ? 0 : x; break;
+                case 4: s.pdf_bsdf = isfinite(x) ? -1 : x; break;
+                case 5: s.pdf_guide = isfinite(x) ? -1 : x; break;
+                case 6: s.direction[i / 100 % 3] = isfinite(x) ? NAN : x; break;
+                case 7: memset(s.direction, 0, sizeof s.direction); break;
+                case 8: s.position[i / 100 % 3] = isfinite(x) ? NAN : x; break;
+                case 9: s.pdf_mix = 0; break;
+                default: s.radiance = 1e15f; s.pdf_mix = 1e-20f; break; /* a quotient beyond the limit */
+                }
+                dirty[m++] = s;
+            }
+            total += m - N;
+            learn(a, clean, N);
+            learn(b, dirty, m);
+            OK(gsd_refine(a, NULL, NULL, NULL));
+            OK(gsd_refine(b, NULL, NULL, NULL));
+        }
+        gsd_stats sa, sb;
+        gsd_get_stats(a, &sa);
+        gsd_get_stats(b, &sb);
+        assert_int_equal(sa.refused, 0);
+        assert_int_equal(sb.refused, total);
+        b->stats.refused = 0;
+        assert_true(same_fields(a, b));
+        gsd_destroy(a);
+        gsd_destroy(b);
+    }
+}
+
+static void test_positions_outside_are_clamped_and_counted(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    gsd_field *f;
+    float out[3] = {2, 0.5f, 0.5f}, dir[3] = {0, 0, 2};
+    OK(gsd_create(&d, &f));
+    gsd_training_sample s = gsd_make_scalar_sample(out, dir, 1, 1, 1, 1, 1, 0);
+    learn(f, &s, 1);
+    gsd_stats stats;
+    gsd_get_stats(f, &stats);
+    assert_int_equal(stats.clamped, 1);
+    assert_int_equal(stats.refused, 0);
+    assert_int_equal(stats.samples, 1);
+    gsd_destroy(f);
+}
+
+static void test_rejected_and_zero_samples_count(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_SIMPLE);
+    gsd_field *f;
+    float p[3] = {0.5f, 0.5f, 0.5f}, dir[3] = {0, 0, 1};
+    gsd_training_sample s[3];
+    OK(gsd_create(&d, &f));
+    s[0] = gsd_make_scalar_sample(p, dir, GSD_REJECTED, 5, 5, 1, 1, 0);
+    s[1] = gsd_make_scalar_sample(p, dir, 0, 0, 0, 1, 1, 0);
+    s[2] = gsd_make_scalar_sample(p, dir, 1, 1, 1, 1, 1, 0);
+    learn(f, s, 3);
+    gsd_stats stats;
+    gsd_get_stats(f, &stats);
+    assert_int_equal(stats.samples, 3);
+    assert_int_equal(stats.rejected, 1);
+    assert_int_equal(stats.zeros, 2);
+    gsd_tree t = export(f, GSD_PART_BUILDING, 0);
+    double total = 0;
+    for (int i = 0; i < 4; ++i)
+        total += (double)t.value[i];
+    assert_true(total > 0 && total < 1);
+    free_tree(&t);
+    gsd_destroy(f);
+    /* nothing at all, and only zeros: still uniform, still valid */
+    OK(gsd_create(&d, &f));
+    OK(gsd_accumulate(f, NULL, 0, NULL, NULL));
+    OK(gsd_refine(f, NULL, NULL, NULL));
+    for (int i = 0; i < 200; ++i)
+        learn(f, &s[1], 1);
+    OK(gsd_refine(f, NULL, NULL, NULL));
+    OK(gsd_validate(f));
+    gsd_view v = gsd_get_view(f);
+    gsd_handle h = gsd_find(&v, p, NULL);
+    assert_true(fabsf(gsd_pdf(&v, &h, dir) - 0.0795775f) < 1e-6f && h.alpha == 1);
+    gsd_destroy(f);
+}
+
+/* One scenario with every kind of call; returns how many failed for want of memory. */
+static int scenario(counter *c)
+{
+    gsd_desc d = {0};
+    gsd_field *f = NULL;
+    gsd_stream *stream = NULL;
+    static gsd_training_sample s[3000];
+    static uint32_t cells[3000];
+    int failed = 0;
+    d.forest_cells = 3;
+    d.alias = true;
+    d.target = GSD_TARGET_SIMPLE;
+    use_counter(&d, c);
+    seed(1);
+    if (gsd_create(&d, &f)) {
+        assert_null(f);
+        return 1;
+    }
+    for (int i = 0; i < 3000; ++i) {
+        float p[3] = {0.5f, 0.5f, 0.5f}, dir[3];
+        random_direction(dir);
+        s[i] = gsd_make_scalar_sample(p, dir, 1, dir[0] > 0.8f ? 1 : 0.1f, 1, 0.0795775f, 0.0795775f, 0);
+        cells[i] = (uint32_t)i % 3;
+    }
+    failed += gsd_stream_create(f, &stream) != GSD_OK;
+    for (int pass = 0; pass < 2; ++pass) {
+        uint32_t child[4] = {0}, bad;
+        float value[4] = {1, 2, 3, 4};
+        gsd_tree t = {1, 1, child, value};
+        failed += stream && gsd_record_cells(stream, cells, s, 3000) != GSD_OK;
+        failed += stream && gsd_accumulate(f, &stream, 1, NULL, NULL) != GSD_OK;
+        if (stream)
+            gsd_stream_clear(stream);
+        failed += gsd_refine(f, NULL, NULL, NULL) != GSD_OK;
+        OK(gsd_validate(f));
+        failed += gsd_forest_split(f, 0, 0, gsd_cell_count(f) + 5) != GSD_OK;
+        OK(gsd_validate(f));
+        failed += gsd_import_trees(f, &t, 1) != GSD_OK;
+        OK(gsd_validate(f));
+        gsd_view v = gsd_get_view(f); /* still answers */
+        gsd_handle h = gsd_find_cell(&v, 0);
+        float u[2] = {0.5f, 0.5f}, dir[3];
+        assert_true(gsd_sample(&v, &h, u, dir) > 0);
+        bad = gsd_export_bound(f, GSD_PART_SAMPLING, 1000000);
+        assert_int_equal(bad, 0);
+        size_t size, bound = gsd_save_bound(f);
+        void *data = malloc(bound);
+        gsd_field *g;
+        OK(gsd_save(f, data, bound, &size));
+        gsd_result r = gsd_load(&d, data, size, &g);
+        assert_true(r == GSD_OK || (r == GSD_OUT_OF_MEMORY && !g));
+        failed += r != GSD_OK;
+        gsd_destroy(g);
+        free(data);
+    }
+    gsd_stream_destroy(stream);
+    gsd_destroy(f);
+    return failed;
+}
+
+static void test_every_failed_allocation_is_survived(void **state)
+{
+    (void)state;
+    counter c = {0};
+    assert_int_equal(scenario(&c), 0);
+    assert_int_equal(c.live, 0);
+    long requests = c.requests;
+    assert_true(requests > 40);
+    for (int all = 0; all < 2; ++all)
+        for (long k = 1; k <= requests; ++k) {
+            c = (counter){.fail_at = k, .fail_all = all};
+            assert_true(scenario(&c) >= 1);
+            assert_int_equal(c.live, 0);
+        }
+}
+
+static void test_lost_samples_are_counted(void **state)
+{
+    (void)state;
+    counter c = {0};
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    gsd_field *f;
+    gsd_stream *stream;
+    static gsd_training_sample s[1000];
+    gsd_stats stats;
+    use_counter(&d, &c);
+    OK(gsd_create(&d, &f));
+    OK(gsd_stream_create(f, &stream));
+    gsd_view v = gsd_get_view(f);
+    make_samples(&v, s, 1000);
+    c.fail_at = c.requests + 2; /* the second chunk */
+    assert_int_equal(gsd_record(stream, s, 1000), GSD_OUT_OF_MEMORY);
+    assert_int_equal(gsd_stream_size(stream), 256);
+    c.fail_at = 0;
+    OK(gsd_record(stream, s, 10));
+    OK(gsd_accumulate(f, &stream, 1, NULL, NULL));
+    gsd_get_stats(f, &stats);
+    assert_int_equal(stats.samples, 266);
+    assert_int_equal(stats.lost, 744);
+    gsd_stream_destroy(stream);
+    gsd_destroy(f);
+    assert_int_equal(c.live, 0);
+}
+
+static void test_queries_do_not_allocate(void **state)
+{
+    (void)state;
+    counter c = {0};
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    use_counter(&d, &c);
+    gsd_field *f = train(&d, 2, 2000);
+    long before = c.requests;
+    gsd_view v = gsd_get_view(f);
+    float p[3] = {0.1f, 0.2f, 0.3f}, u[2] = {0.3f, 0.4f}, dir[3], pdf;
+    gsd_handle h;
+    gsd_find_batch(&v, 1, NULL, p, 12, NULL, 0, &h, NULL);
+    gsd_sample_batch(&v, 1, NULL, &h, u, 8, dir, 12, &pdf);
+    gsd_pdf_batch(&v, 1, NULL, &h, dir, 12, &pdf);
+    OK(gsd_validate(f));
+    assert_int_equal(c.requests, before);
+    gsd_destroy(f);
+    assert_int_equal(c.live, 0);
+}
+
+/* ---- memory */
+
+static void test_memory_cap_holds_and_the_field_still_learns(void **state)
+{
+    (void)state;
+    for (int alias = 0; alias < 2; ++alias) {
+        counter c = {0};
+        gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+        d.max_bytes = 1 << 20;
+        d.split_samples = 16;
+        d.rho = 0.0005f;
+        d.min_samples = 1;
+        d.alias = alias;
+        use_counter(&d, &c);
+        gsd_field *f;
+        OK(gsd_create(&d, &f));
+        size_t peak = 0;
+        for (int pass = 0; pass < 5; ++pass) {
+            static gsd_training_sample s[30000];
+            gsd_view v = gsd_get_view(f);
+            make_samples(&v, s, 30000);
+            learn(f, s, 30000);
+            gsdi_release(&f->desc, f->scratch); /* accumulate's scratch is outside the cap */
+            f->scratch = NULL;
+            f->scratch_size = 0;
+            c.peak = c.bytes;
+            OK(gsd_refine(f, NULL, NULL, NULL));
+            OK(gsd_validate(f));
+            peak = c.peak > peak ? c.peak : peak;
+        }
+        gsd_stats stats;
+        gsd_get_stats(f, &stats);
+        assert_true(peak <= d.max_bytes);
+        assert_true(stats.peak_bytes <= d.max_bytes);
+        assert_true((double)peak <= 1.02 * (double)stats.peak_bytes && (double)peak >= 0.9 * (double)stats.peak_bytes);
+        assert_true(stats.effective_rho > d.rho);
+        assert_true(stats.cells > 50 && stats.nodes > 1000);
+        gsd_destroy(f);
+        assert_int_equal(c.live, 0);
+    }
+}
+
+/* ---- gate */
+
+static gsd_stats gate_after(bool peaked, double light_probability, int passes, gsd_field **keep)
+{
+    gsd_desc d = unit_cube(GSD_TARGET_SIMPLE);
+    gsd_field *f;
+    gsd_stats stats;
+    d.split_samples = 4000;
+    OK(gsd_create(&d, &f));
+    for (int pass = 0; pass < passes; ++pass) {
+        uint32_t n = 4000u << (pass < 5 ? pass : 5);
+        gsd_training_sample *s = malloc(n * sizeof *s);
+        gsd_view v = gsd_get_view(f);
+        make_samples(&v, s, n);
+        for (uint32_t i = 0; i < n; ++i) {
+            float L = peaked ? (s[i].direction[0] > 0.97f ? 100 : 0.01f) : 1 + 0.1f * s[i].direction[2];
+            L = rnd() < light_probability ? L : 0;
+            s[i].radiance = s[i].contribution = s[i].pixel_contribution = L;
+        }
+        learn(f, s, n);
+        OK(gsd_refine(f, NULL, NULL, NULL));
+        OK(gsd_validate(f));
+        free(s);
+    }
+    gsd_get_stats(f, &stats);
+    if (keep)
+        *keep = f;
+    else
+        gsd_destroy(f);
+    return stats;
+}
+
+static void test_gate_closes_where_light_is_even(void **state)
+{
+    (void)state;
+    gsd_field *f;
+    seed(1);
+    gsd_stats s = gate_after(false, 1, 6, &f);
+    assert_int_equal(s.open_cells, 0);
+    assert_true(s.closed_share > 0.95f);
+    assert_true(gsd_record_fraction(f) < 0.15f);
+    gsd_view v = gsd_get_view(f);
+    float p[3] = {0.2f, 0.3f, 0.4f};
+    gsd_handle h = gsd_find(&v, p, NULL);
+    assert_true(h.alpha == 1);
+    gsd_destroy(f);
+}
+
+static void test_gate_stays_open_where_light_is_peaked(void **state)
+{
+    (void)state;
+    gsd_field *f;
+    seed(2);
+    gsd_stats s = gate_after(true, 1, 6, &f);
+    assert_int_equal(s.closed_cells, 0);
+    assert_true(s.open_cells > 0 && s.mean_alpha < 0.5f);
+    assert_true(gsd_record_fraction(f) == 1);
+    assert_false(gsd_all_closed(f));
+    gsd_destroy(f);
+}
+
+static void test_gate_leaves_rarely_lit_cells_open(void **state)
+{
+    (void)state;
+    seed(3);
+    gsd_stats s = gate_after(true, 0.002, 5, NULL);
+    assert_int_equal(s.closed_cells, 0);
+}
+
+static void test_gate_off_never_closes(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    d.no_gate = true;
+    d.alpha_mode = GSD_ALPHA_FIXED;
+    gsd_field *f = train(&d, 5, 4000);
+    gsd_view v = gsd_get_view(f);
+    for (uint32_t c = 0; c < v.cell_count; ++c)
+        assert_true(v.cells[c].alpha == 0.5f);
+    gsd_destroy(f);
+}
+
+/* A closed cell opens again when the light changes. */
+static void test_closed_cells_are_tried_again(void **state)
+{
+    (void)state;
+    gsd_field *f;
+    seed(4);
+    gate_after(false, 1, 6, &f);
+    static gsd_training_sample s[60000];
+    for (int pass = 0; pass < 4; ++pass) {
+        gsd_view v = gsd_get_view(f);
+        make_samples(&v, s, 60000);
+        for (int i = 0; i < 60000; ++i) {
+            float L = s[i].direction[0] > 0.97f ? 100 : 0.01f;
+            s[i].radiance = s[i].contribution = s[i].pixel_contribution = L;
+        }
+        learn(f, s, 60000);
+        OK(gsd_refine(f, NULL, NULL, NULL));
+    }
+    gsd_stats stats;
+    gsd_get_stats(f, &stats);
+    assert_true(stats.probed > 0);
+    assert_true(stats.open_cells > stats.closed_cells);
+    gsd_destroy(f);
+}
+
+/* alpha goes where the second moment is least: low with a good guide, both ways of learning it. */
+static void test_alpha_is_learned(void **state)
+{
+    (void)state;
+    for (int mode = GSD_ALPHA_ADAM; mode <= GSD_ALPHA_GRID; ++mode)
+        for (int target = GSD_TARGET_RADIANCE; target <= GSD_TARGET_SIMPLE; ++target) {
+            gsd_desc d = unit_cube((gsd_target)target);
+            d.alpha_mode = (gsd_alpha_mode)mode;
+            d.no_gate = true;
+            seed(9);
+            gsd_field *f = train(&d, 5, 4000);
+            gsd_view v = gsd_get_view(f);
+            for (uint32_t c = 0; c < v.cell_count; ++c)
+                assert_true(v.cells[c].alpha >= 0.0499f && v.cells[c].alpha < 0.45f);
+            gsd_destroy(f);
+        }
+}
+
+/* ---- structure */
+
+static void test_unread_and_waiting_cells_are_left_alone(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    d.split_samples = 300;
+    seed(1);
+    gsd_field *f = train(&d, 3, 8000);
+    gsd_stats before, after;
+    gsd_get_stats(f, &before);
+    static gsd_training_sample s[4000];
+    gsd_view v = gsd_get_view(f);
+    gsd_tree far_before = {0}, far_after;
+    float far[3] = {0.9f, 0.9f, 0.9f}, near[3] = {0.01f, 0.01f, 0.01f};
+    uint32_t cell = gsd_find(&v, far, NULL).cell;
+    assert_true(cell != gsd_find(&v, near, NULL).cell);
+    far_before = export(f, GSD_PART_SAMPLING, cell);
+    make_samples(&v, s, 4000);
+    for (int i = 0; i < 4000; ++i)
+        memcpy(s[i].position, i < 10 ? far : near, sizeof far);
+    learn(f, s, 4000);
+    OK(gsd_refine(f, NULL, NULL, NULL));
+    OK(gsd_validate(f));
+    gsd_get_stats(f, &after);
+    assert_int_equal(after.rebuilt_trees, 1);
+    assert_int_equal(after.waiting_cells, 1);
+    assert_int_equal(after.unread_cells, before.cells - 2);
+    far_after = export(f, GSD_PART_SAMPLING, cell);
+    assert_int_equal(far_before.count, far_after.count);
+    assert_memory_equal(far_before.value, far_after.value, far_after.count * 16);
+    assert_memory_equal(far_before.child, far_after.child, far_after.count * 16);
+    free_tree(&far_before);
+    free_tree(&far_after);
+    gsd_destroy(f);
+}
+
+static void test_forest_split_export_and_import(void **state)
+{
+    (void)state;
+    seed(77);
+    gsd_field *f = forest_of(4, 50, 12, false, GSD_SIMD_AUTO);
+    gsd_tree before = export(f, GSD_PART_SAMPLING, 2);
+    assert_int_equal(gsd_forest_split(f, 9, 1, 2), GSD_BAD_CELL);
+    assert_int_equal(gsd_forest_split(f, 1, 2, 2), GSD_BAD_CELL);
+    OK(gsd_forest_split(f, 2, 2, 7));
+    assert_int_equal(gsd_cell_count(f), 8);
+    OK(gsd_validate(f));
+    for (uint32_t c = 2; c <= 7; c += 5) {
+        gsd_tree t = export(f, GSD_PART_SAMPLING, c);
+        assert_int_equal(t.count, before.count);
+        assert_memory_equal(t.value, before.value, t.count * 16);
+        free_tree(&t);
+    }
+    /* round trip: masses survive to the precision of a float density over the uniform share */
+    before.cell = 5;
+    OK(gsd_import_trees(f, &before, 1));
+    gsd_tree again = export(f, GSD_PART_SAMPLING, 5);
+    for (uint32_t i = 0; i < before.count * 4; ++i)
+        assert_true(fabsf(again.value[i] - before.value[i]) <= 2e-6f * before.value[i] + 1e-7f);
+    /* the split cells train apart */
+    gsd_stream *stream;
+    static gsd_training_sample s[500];
+    static uint32_t cells[500];
+    OK(gsd_stream_create(f, &stream));
+    for (int i = 0; i < 500; ++i) {
+        float p[3] = {0, 0, 0}, d[3];
+        random_direction(d);
+        s[i] = gsd_make_scalar_sample(p, d, 1 + 10 * (d[0] > 0.5f), 1, 1, 0.0795775f, 0.0795775f, 0);
+        cells[i] = 7;
+    }
+    cells[0] = 8; /* no such cell: refused */
+    OK(gsd_record_cells(stream, cells, s, 500));
+    OK(gsd_accumulate(f, &stream, 1, NULL, NULL));
+    OK(gsd_refine(f, NULL, NULL, NULL));
+    OK(gsd_validate(f));
+    gsd_stats stats;
+    gsd_get_stats(f, &stats);
+    assert_int_equal(stats.refused, 1);
+    assert_int_equal(stats.rebuilt_trees, 1);
+    gsd_tree two = export(f, GSD_PART_SAMPLING, 2);
+    assert_memory_equal(two.value, before.value, two.count * 16);
+    /* trees that are none are refused and change nothing */
+    uint32_t child[8] = {1, 0, 0, 0, 1, 0, 0, 0};
+    float value[8] = {1, 1, 1, 1, 1, 1, 1, 1};
+    gsd_tree bad = {0, 2, child, value};
+    assert_int_equal(gsd_import_trees(f, &bad, 1), GSD_BAD_TREE); /* refers to itself */
+    child[4] = 0;
+    value[6] = NAN;
+    assert_int_equal(gsd_import_trees(f, &bad, 1), GSD_BAD_TREE);
+    value[6] = 0;
+    child[0] = 0;
+    assert_int_equal(gsd_import_trees(f, &bad, 1), GSD_BAD_TREE); /* a node that nothing refers to */
+    bad.cell = 100;
+    assert_int_equal(gsd_import_trees(f, &bad, 1), GSD_BAD_CELL);
+    OK(gsd_validate(f));
+    gsd_stream_destroy(stream);
+    free_tree(&before);
+    free_tree(&again);
+    free_tree(&two);
+    gsd_destroy(f);
+}
+
+/* ---- files */
+
+static void test_save_and_load_give_the_same_field(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_SWITCHING);
+    d.alias = true;
+    d.split_samples = 500;
+    seed(5);
+    gsd_field *f = train(&d, 4, 2000), *g;
+    static gsd_training_sample s[3000];
+    gsd_view v = gsd_get_view(f);
+    make_samples(&v, s, 3000);
+    learn(f, s, 3000); /* in the middle of a pass */
+    size_t size;
+    unsigned char *data = save(f, &size), *odd = malloc(size + 1);
+    memcpy(odd + 1, data, size); /* unaligned */
+    OK(gsd_load(NULL, odd + 1, size, &g));
+    assert_true(same_fields(f, g));
+    assert_int_equal(gsd_structure_id(f), gsd_structure_id(g));
+    make_samples(&v, s, 3000);
+    learn(f, s, 3000);
+    learn(g, s, 3000);
+    OK(gsd_refine(f, NULL, NULL, NULL));
+    OK(gsd_refine(g, NULL, NULL, NULL));
+    assert_true(same_fields(f, g));
+    assert_int_equal(gsd_save(f, data, 10, &size), GSD_BUFFER_TOO_SMALL);
+    gsd_destroy(f);
+    gsd_destroy(g);
+    free(odd);
+    free(data);
+}
+
+/* A short save of a field that has everything. */
+static unsigned char *small_save(size_t *size)
+{
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    d.alias = true;
+    d.split_samples = 1000;
+    d.rho = 0.05f;
+    seed(6);
+    gsd_field *f = train(&d, 3, 1500);
+    unsigned char *data = save(f, size);
+    gsd_destroy(f);
+    return data;
+}
+
+static void test_truncated_and_flipped_saves_are_refused(void **state)
+{
+    (void)state;
+    size_t size;
+    unsigned char *data = small_save(&size);
+    gsd_field *g;
+    for (size_t n = 0; n < size; n += n < 2000 ? 1 : 331) {
+        unsigned char *exact = malloc(n ? n : 1);
+        memcpy(exact, data, n);
+        assert_int_not_equal(gsd_load(NULL, exact, n, &g), GSD_OK);
+        assert_null(g);
+        free(exact);
+    }
+    for (size_t bit = 0; bit < size * 8; bit += bit < 8000 ? 1 : 997) {
+        data[bit / 8] ^= (unsigned char)(1u << (bit % 8));
+        assert_int_not_equal(gsd_load(NULL, data, size, &g), GSD_OK);
+        assert_null(g);
+        data[bit / 8] ^= (unsigned char)(1u << (bit % 8));
+    }
+    OK(gsd_load(NULL, data, size, &g));
+    gsd_destroy(g);
+    free(data);
+}
+
+/* The same with the checksum made right again: what loads must be whole, everything else is refused. */
+static void test_forged_saves_never_harm(void **state)
+{
+    (void)state;
+    size_t size;
+    unsigned char *data = small_save(&size), *forged = malloc(size);
+    long loaded = 0, refused = 0;
+    seed(12);
+    for (long i = 0; i < scaled(3000); ++i) {
+        gsdi_file f;
+        gsd_field *g;
+        memcpy(forged, data, size);
+        for (int k = 0; k <= i % 3; ++k) {
+            size_t at = i % 2 ? (size_t)(rnd() * 700) : (size_t)(rnd() * (double)size);
+            uint32_t word = i % 5 ? (uint32_t)rng_next() >> (rng_next() & 31) : 0xffffffffu;
+            at = at / 4 * 4 < size - 4 ? at / 4 * 4 : size - 4;
+            memcpy(forged + at, &word, 4);
+        }
+        memcpy(&f, forged, sizeof f);
+        f.checksum = gsdi_file_checksum(&f, forged + sizeof f, size - sizeof f);
+        memcpy(forged, &f, sizeof f);
+        if (gsd_load(NULL, forged, size, &g) != GSD_OK) {
+            refused++;
+            continue;
+        }
+        loaded++;
+        OK(gsd_validate(g)); /* and it can be used and trained */
+        gsd_view v = gsd_get_view(g);
+        static gsd_training_sample s[64];
+        make_samples(&v, s, 64);
+        learn(g, s, 64);
+        assert_int_not_equal(gsd_refine(g, NULL, NULL, NULL), GSD_CORRUPT);
+        gsd_destroy(g);
+    }
+    assert_true(refused > 100 && loaded > 10);
+    free(data);
+    free(forged);
+}
+
+static void test_merge_equals_training_together(void **state)
+{
+    (void)state;
+    enum { N = 20000 };
+    gsd_desc d = unit_cube(GSD_TARGET_SIMPLE);
+    d.split_samples = 1000;
+    seed(8);
+    gsd_field *a = train(&d, 3, 4000), *b, *both, *other;
+    size_t size;
+    void *data = save(a, &size);
+    OK(gsd_load(NULL, data, size, &b));
+    OK(gsd_load(NULL, data, size, &both));
+    static gsd_training_sample s[N];
+    gsd_view v = gsd_get_view(a);
+    make_samples(&v, s, N);
+    for (uint32_t i = 0; i < gsd_cell_count(a); ++i) { /* what is kept from earlier passes would count twice */
+        gsdi_state *t = &b->states[i];
+        memset(t->bins, 0, sizeof t->bins);
+        memset(t->v, 0, sizeof t->v);
+        memset(t->vv, 0, sizeof t->vv);
+        memset(t->cross, 0, sizeof t->cross);
+        t->gate_count = t->held = 0;
+    }
+    memset(b->sum, 0, b->building_nodes * sizeof *b->sum);
+    learn(a, s, N / 2);
+    learn(b, s + N / 2, N / 2);
+    learn(both, s, N);
+    OK(gsd_merge(a, b));
+    OK(gsd_refine(a, NULL, NULL, NULL));
+    OK(gsd_refine(both, NULL, NULL, NULL));
+    OK(gsd_validate(a));
+    assert_int_equal(gsd_cell_count(a), gsd_cell_count(both));
+    gsd_view va = gsd_get_view(a), vb = gsd_get_view(both);
+    for (int i = 0; i < 5000; ++i) {
+        float dir[3], p[3] = {rndf(), rndf(), rndf()};
+        random_direction(dir);
+        gsd_handle ha = gsd_find(&va, p, NULL), hb = gsd_find(&vb, p, NULL);
+        float pa = gsd_pdf(&va, &ha, dir), pb = gsd_pdf(&vb, &hb, dir);
+        assert_true(fabsf(pa - pb) <= 1e-5f * pb);
+    }
+    gsd_stats sa, sb;
+    gsd_get_stats(a, &sa);
+    gsd_get_stats(both, &sb);
+    assert_int_equal(sa.samples - sb.samples, sb.samples - N); /* b's history counts twice */
+    /* another structure: refused */
+    assert_int_equal(gsd_merge(a, b), GSD_MISMATCH);
+    OK(gsd_create(&d, &other));
+    assert_int_equal(gsd_merge(b, other), GSD_MISMATCH);
+    gsd_destroy(a);
+    gsd_destroy(b);
+    gsd_destroy(both);
+    gsd_destroy(other);
+    free(data);
+}
+
+static void test_validate_notices_damage(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    d.split_samples = 300;
+    seed(5);
+    gsd_field *f = train(&d, 3, 3000);
+    uint32_t *child = f->child, save_child = child[0];
+    child[0] = 0x7fffffff;
+    assert_int_equal(gsd_validate(f), GSD_CORRUPT);
+    child[0] = save_child;
+    OK(gsd_validate(f));
+    gsd_node *n = &gsdi_nodes(f->block)[f->block->nodes - 1];
+    gsd_node keep = *n;
+    n->leaf.pdf = NAN;
+    assert_int_equal(gsd_validate(f), GSD_CORRUPT);
+    *n = keep;
+    gsdi_words(f->block, f->block->spatial_at)[0] = GSD_CELL_BIT | 1000000;
+    assert_int_equal(gsd_validate(f), GSD_CORRUPT);
+    gsd_destroy(f);
+}
+
+int main(void)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(test_documented_defaults_are_the_defaults),
+        cmocka_unit_test(test_bad_descriptors_are_refused_by_name),
+        cmocka_unit_test(test_sizes_are_as_documented),
+        cmocka_unit_test(test_pdf_integrates_to_one),
+        cmocka_unit_test(test_samples_follow_the_density),
+        cmocka_unit_test(test_alias_samples_follow_the_density),
+        cmocka_unit_test(test_samples_are_uniform_within_a_leaf),
+        cmocka_unit_test(test_sample_and_pdf_agree),
+        cmocka_unit_test(test_estimates_with_the_density_are_unbiased),
+        cmocka_unit_test(test_seam_poles_and_odd_directions),
+        cmocka_unit_test(test_batches_equal_single_queries_at_every_level),
+        cmocka_unit_test(test_results_do_not_depend_on_threads_or_cuts),
+        cmocka_unit_test(test_targets_match_a_naive_reference),
+        cmocka_unit_test(test_box_filter_matches_brute_force),
+        cmocka_unit_test(test_trees_refine_where_the_mass_is),
+        cmocka_unit_test(test_cells_split_where_samples_are),
+        cmocka_unit_test(test_thin_wall_lit_from_one_side),
+        cmocka_unit_test(test_bad_samples_are_refused_and_leave_no_trace),
+        cmocka_unit_test(test_positions_outside_are_clamped_and_counted),
+        cmocka_unit_test(test_rejected_and_zero_samples_count),
+        cmocka_unit_test(test_every_failed_allocation_is_survived),
+        cmocka_unit_test(test_lost_samples_are_counted),
+        cmocka_unit_test(test_queries_do_not_allocate),
+        cmocka_unit_test(test_memory_cap_holds_and_the_field_still_learns),
+        cmocka_unit_test(test_gate_closes_where_light_is_even),
+        cmocka_unit_test(test_gate_stays_open_where_light_is_peaked),
+        cmocka_unit_test(test_gate_leaves_rarely_lit_cells_open),
+        cmocka_unit_test(test_gate_off_never_closes),
+        cmocka_unit_test(test_closed_cells_are_tried_again),
+        cmocka_unit_test(test_alpha_is_learned),
+        cmocka_unit_test(test_unread_and_waiting_cells_are_left_alone),
+        cmocka_unit_test(test_forest_split_export_and_import),
+        cmocka_unit_test(test_save_and_load_give_the_same_field),
+        cmocka_unit_test(test_truncated_and_flipped_saves_are_refused),
+        cmocka_unit_test(test_forged_saves_never_harm),
+        cmocka_unit_test(test_merge_equals_training_together),
+        cmocka_unit_test(test_validate_notices_damage),
+    };
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}
