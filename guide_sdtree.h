@@ -11,18 +11,16 @@
        #include "guide_sdtree.h"
        int main(void)
        {
-           static gsd_desc desc; // zero: all defaults; the box 0 .. 1
-           gsd_field *field;
-           gsd_stream *stream;
-           desc.bounds_max[0] = desc.bounds_max[1] = desc.bounds_max[2] = 1;
+           static gsd_desc desc; // zero: all defaults
+           gsd_field *field; gsd_stream *stream;
+           desc.bounds_max[0] = desc.bounds_max[1] = desc.bounds_max[2] = 1; // the scene: a box 0 .. 1
            if (gsd_create(&desc, &field) || gsd_stream_create(field, &stream))
                return 1;
-           for (unsigned pass = 0, state = 1; pass < 6; ++pass) { // a pass: trace with the field, then learn
+           for (int pass = 0; pass < 6; ++pass) { // trace with the field, then learn
                gsd_view view = gsd_get_view(field);
                for (int i = 0; i < (1000 << pass); ++i) { // "trace": a lamp of radiance 100 around +x
-                   float p[3] = {0.5f, 0.5f, 0.5f}, d[3], u[2];
-                   for (int k = 0; k < 2; ++k)
-                       u[k] = (float)((state = state * 1664525u + 1013904223u) >> 8) / 16777216.0f;
+                   float p[3] = {0.5f, 0.5f, 0.5f}, d[3];
+                   float u[2] = {(float)(rand() & 0xffff) / 65536.0f, (float)(rand() & 0xffff) / 65536.0f};
                    gsd_handle handle = gsd_find(&view, p, NULL);
                    float pdf = gsd_sample(&view, &handle, u, d), L = d[0] > 0.95f ? 100.0f : 1.0f;
                    gsd_training_sample sample = gsd_make_scalar_sample(p, d, L, L, L, pdf, pdf, 0);
@@ -40,7 +38,8 @@
      >>types     descriptor, sample, results   >>batch   find, sample, pdf of arrays
      >>field     create, refine, stats         >>store   save, load, merge, export, import
      implementation:
-     >>memory  >>math  >>streams  >>trees  >>accumulate  >>gate  >>refine  >>block  >>forest  >>batches  >>files  >>licence
+     >>memory  >>math  >>streams  >>trees  >>accumulate  >>gate  >>block  >>refine  >>life  >>forest  >>batches
+     >>files  >>check  >>plain  >>licence
 
    HOW IT WORKS
      Space is a binary tree over a cube: axes in turn, cut in the middle, a leaf (*cell*) splits when it saw more than
@@ -61,13 +60,15 @@
      Selection probability: handle.alpha is the probability to sample the BSDF; 1 means: do not guide here. The caller
      draws from the BSDF with alpha, else from gsd_sample, and divides by alpha pdf_bsdf + (1 - alpha) gsd_pdf.
 
-     Gate: guiding is used in a cell until its own samples show that it does not pay. V(a) = mean of contribution^2 /
-     (p p_a), p_a = a pdf_bsdf + (1 - a) pdf_guide, is the second moment with selection probability a; m = mean of
-     contribution / p. Guiding pays where V(1) > (1 + gate_margin) V(a) + gate_gain m^2: it must save a share of the
-     second moment, and enough noise to be worth its time. Samples of a pass judge the tree built from earlier passes.
-     Since V(a) >= m^2 for the best of guides, a cell with V(1) < (1 + gate_gain) m^2 closes without waiting for a
+     Gate: guiding is used in a cell until its own samples show that it does not pay. V(a) = mean of g^2 / (p p_a), with
+     g = contribution, p_a = a pdf_bsdf + (1 - a) pdf_guide, is the second moment with selection probability a; m = mean
+     of g / p; W^2 = mean of (pixel_contribution / g)^2, weighted as in V(1), turns squared contributions into squared
+     pixels. Guiding pays where V(1) > (1 + gate_margin) V(a) + gate_gain / W^2: it must save a share of the second
+     moment, and enough of the pixel's noise to be worth its time. Samples of a pass judge the tree built from earlier
+     passes. Since no guide has V(a) < m^2, a cell with V(1) < m^2 + gate_gain / W^2 closes without waiting for a good
      tree. Verdicts need 95 % confidence and many non-zero samples: cells whose light is rarely found stay open. Closed
      cells are tried again every gate_probe passes and need more to open than to close. Cells without verdict guide.
+     Without a pixel estimate (gsd_pass.pixel_estimate) 1 / W^2 = 16 m^2.
 
    THE SAMPLE
      One per non-delta path vertex whose direction was traced. radiance L: from that direction, no cosine, no BSDF, not
@@ -85,8 +86,8 @@
      Building part: 12 bytes per quadtree node, sizeof(gsd_cell_state) (below 600) per cell.
      max_bytes bounds the peak of both parts while refine runs, old and new together: trees coarsen and cells stop
      splitting; it never fails. Streams (48 bytes per sample) and the scratch of accumulate (at most 12 MB and 8 bytes
-     per cell, kept for the next call) come on top. Allocation happens in create, stream_create, record, accumulate, refine, import, load,
-     gsd_forest_split; never in a query. Stack: below 16 KB per call.
+     per cell, kept for the next call) come on top. Allocation happens in create, stream_create, record, accumulate,
+   refine, import, load, gsd_forest_split; never in a query. Stack: below 16 KB per call.
 
    THREADS: each function has a tag.
      [any thread]   pure function on constant data
@@ -198,28 +199,28 @@ typedef enum gsd_simd { GSD_SIMD_AUTO, GSD_SIMD_SCALAR, GSD_SIMD_AVX2, GSD_SIMD_
 typedef struct gsd_desc {
     float bounds_min[3], bounds_max[3]; /* world-space box of the positions; made a cube and 0.1 % larger */
     gsd_target target;
-    uint32_t switch_pass;  /* switching: first variance-aware pass, 1 .. 1000; default 4 (passes 0..3 have 15 spp) */
-    float split_samples;   /* c, samples a cell holds before it splits, 16 .. 1e9; default 1000 */
-    float rho;             /* share of a quadtree's mass above which a node is divided, 1e-5 .. 1; default 0.01 */
-    uint32_t max_depth;    /* of quadtrees, 1 .. 20; default 16 */
-    uint32_t max_levels;   /* of the spatial tree (3 levels halve all axes), 1 .. 60; default 48 */
-    uint32_t min_samples;  /* a cell with fewer new samples waits for more before its tree is rebuilt; default 64 */
-    uint64_t max_bytes;    /* memory cap, see MEMORY; >= 65536; default 2^30 */
+    uint32_t switch_pass; /* switching: first variance-aware pass, 1 .. 1000; default 4 (passes 0..3 have 15 spp) */
+    float split_samples;  /* c, samples a cell holds before it splits, 16 .. 1e9; default 1000 */
+    float rho;            /* share of a quadtree's mass above which a node is divided, 1e-5 .. 1; default 0.01 */
+    uint32_t max_depth;   /* of quadtrees, 1 .. 20; default 16 */
+    uint32_t max_levels;  /* of the spatial tree (3 levels halve all axes), 1 .. 60; default 48 */
+    uint32_t min_samples; /* a cell with fewer new samples waits for more before its tree is rebuilt; default 64 */
+    uint64_t max_bytes;   /* memory cap, see MEMORY; >= 65536; default 2^30 */
     gsd_spatial_filter spatial_filter;
     gsd_directional_filter directional_filter;
     gsd_alpha_mode alpha_mode;
-    float alpha;            /* start value (and fixed value) of the probability of BSDF sampling, 0.05 .. 1; default 0.5 */
-    float uniform;          /* e, share of uniform sampling in the guide's density, 1e-4 .. 1; default 0.01 */
-    bool no_gate;           /* guide in every cell */
-    bool no_guide_weight;   /* second-moment targets: w = 1 */
-    bool no_history;        /* clear the sums in every refine. Otherwise a cell whose pass brought less than 1.5 times
-                               the samples it held keeps half of its sums: passes of equal size then add up */
-    bool alias;             /* build alias tables: sampling in constant time, but not monotone in u; + 12 bytes a leaf */
-    float gate_margin;      /* V(1) / V(a) - 1 below which guiding does not pay, 0.001 .. 10; default 0.05 */
-    float gate_gain;        /* (V(1) - V(a)) / m^2 below which guiding does not pay, 0.001 .. 1000; default 4 */
-    uint32_t gate_probe;    /* passes between tries of a closed cell, 1 .. 1000; default 1 */
-    uint32_t forest_cells;  /* > 0: no spatial tree; that many cells, which the caller addresses by index */
-    gsd_simd simd;          /* pin the level of the batch queries; default: the best that this machine has */
+    float alpha;   /* start value (and fixed value) of the probability of BSDF sampling, 0.05 .. 1; default 0.5 */
+    float uniform; /* e, share of uniform sampling in the guide's density, 1e-4 .. 1; default 0.01 */
+    bool no_gate;  /* guide in every cell */
+    bool no_guide_weight;  /* second-moment targets: w = 1 */
+    bool no_history;       /* clear the sums in every refine. Otherwise a cell whose pass brought less than 1.5 times
+                              the samples it held keeps half of its sums: passes of equal size then add up */
+    bool alias;            /* build alias tables: sampling in constant time, but not monotone in u; + 12 bytes a leaf */
+    float gate_margin;     /* V(1) / V(a) - 1 below which guiding does not pay, 0.001 .. 10; default 0.05 */
+    float gate_gain;       /* V(1) - V(a) below which guiding does not pay, 0.0001 .. 1000; default 0.25 */
+    uint32_t gate_probe;   /* passes between tries of a closed cell, 1 .. 1000; default 1 */
+    uint32_t forest_cells; /* > 0: no spatial tree; that many cells, which the caller addresses by index */
+    gsd_simd simd;         /* pin the level of the batch queries; default: the best that this machine has */
     void *(*allocate)(void *user, size_t size); /* default malloc; NULL on failure; 16-byte aligned */
     void (*release)(void *user, void *pointer); /* default free; pointer may be NULL */
     void *user;
@@ -231,7 +232,8 @@ typedef struct gsd_training_sample {
     float direction[3];       /* unit */
     float radiance;           /* mean over channels of L; GSD_REJECTED */
     float contribution;       /* mean over channels of f L cos */
-    float pixel_contribution; /* mean over channels of f L cos * throughput before this vertex / pixel estimate */
+    float pixel_contribution; /* mean over channels of f L cos * throughput before this vertex / pixel estimate; not
+                                 used by target radiance and simple without gsd_pass.pixel_estimate */
     float pdf_mix;            /* what the direction was drawn with */
     float pdf_bsdf;
     float pdf_guide; /* 0 = not evaluated */
@@ -240,7 +242,9 @@ typedef struct gsd_training_sample {
 
 /* Optional facts about the pass that refine ends. */
 typedef struct gsd_pass {
-    uint32_t spp; /* samples per pixel of the pass: k = log2(spp / spp of the first pass); 0 = k from recorded samples */
+    uint32_t
+        spp; /* samples per pixel of the pass: k = log2(spp / spp of the first pass); 0 = k from recorded samples */
+    bool pixel_estimate; /* the pass's pixel_contributions were relative to a pixel estimate: see Gate */
 } gsd_pass;
 
 typedef void (*gsd_range_fn)(void *context, uint32_t begin, uint32_t end);
@@ -250,43 +254,44 @@ typedef void (*gsd_parallel_fn)(void *user, uint32_t count, uint32_t grain, gsd_
 typedef struct gsd_field gsd_field;
 typedef struct gsd_stream gsd_stream;
 
-/* Counters since create unless they say otherwise. */
+/* Counters since create unless they say otherwise. No padding: a save holds it as it is. */
 typedef struct gsd_stats {
-    uint64_t samples;       /* accepted by accumulate */
-    uint64_t zeros;         /* of which radiance or contribution was 0 */
-    uint64_t rejected;      /* of which GSD_REJECTED */
-    uint64_t refused;       /* bad samples; best 0 */
-    uint64_t clamped;       /* positions outside the bounds; best 0 */
-    uint64_t lost;          /* samples that met a failed allocation; best 0 */
-    uint32_t passes;        /* calls of refine */
-    uint32_t cells;         /* now */
-    uint32_t trees;         /* distinct quadtrees in the sampling part now (cells share after a split) */
-    uint64_t nodes;         /* quadtree nodes in the sampling part now */
-    uint64_t leaves;        /* of which leaves */
+    uint64_t samples;  /* accepted by accumulate */
+    uint64_t zeros;    /* of which radiance or contribution was 0 */
+    uint64_t rejected; /* of which GSD_REJECTED */
+    uint64_t refused;  /* bad samples; best 0 */
+    uint64_t clamped;  /* positions outside the bounds; best 0 */
+    uint64_t lost;     /* samples that met a failed allocation; best 0 */
+    uint64_t nodes;    /* quadtree nodes in the sampling part now */
+    uint64_t leaves;   /* of which leaves */
     uint64_t building_nodes;
-    uint64_t bytes;         /* sampling and building part now */
-    uint64_t peak_bytes;    /* most held at once by both, old and new; <= max_bytes */
-    uint32_t max_depth;     /* deepest leaf now */
-    float mean_depth;       /* mean leaf depth weighted by mass; 0 = nothing learned */
-    float effective_rho;    /* rho of the last refine, above desc.rho where max_bytes forced it; best desc.rho */
-    uint32_t split_cells;   /* by the last refine */
-    uint32_t rebuilt_trees; /* last refine: cells with new samples */
-    uint32_t waiting_cells; /* last refine: too few new samples, tree kept */
-    uint32_t unread_cells;  /* last refine: no new samples: no work done */
-    uint32_t open_cells;    /* gate: guiding shown to pay */
-    uint32_t closed_cells;  /* gate: shown not to pay; alpha = 1 */
-    uint32_t unjudged_cells; /* gate: guiding, no verdict yet */
-    uint64_t opened, closed; /* verdicts so far */
-    uint64_t probed;        /* cells tried again so far */
-    float closed_share;     /* share of the last pass's samples in closed cells, 0 .. 1 */
-    float mean_alpha;       /* over the last pass's samples, closed cells as 1 */
+    uint64_t bytes;          /* sampling and building part now */
+    uint64_t peak_bytes;     /* most held at once by both, old and new; <= max_bytes */
+    uint64_t opened, closed; /* verdicts of the gate so far */
+    uint64_t probed;         /* closed cells tried again so far */
+    uint32_t passes;         /* calls of refine */
+    uint32_t cells;          /* now */
+    uint32_t trees;          /* distinct quadtrees in the sampling part now (cells share after a split) */
+    uint32_t max_depth;      /* deepest leaf now */
+    uint32_t split_cells;    /* by the last refine */
+    uint32_t rebuilt_trees;  /* last refine: cells with new samples */
+    uint32_t waiting_cells;  /* last refine: too few new samples, tree kept */
+    uint32_t unread_cells;   /* last refine: no new samples: no work done */
+    uint32_t open_cells;     /* gate: guiding shown to pay */
+    uint32_t closed_cells;   /* gate: shown not to pay; alpha = 1 */
+    uint32_t unjudged_cells; /* gate: guiding (once there is a tree), no verdict yet */
+    float effective_rho;     /* rho of the last refine, above desc.rho where max_bytes forced it; best desc.rho */
+    float mean_depth;        /* mean over trees of leaf depth weighted by mass; 0 = nothing learned */
+    float closed_share;      /* share of the last pass's samples in closed cells, 0 .. 1 */
+    float mean_alpha;        /* over the last pass's samples, closed cells as 1 */
+    float reserved;
 } gsd_stats;
 
 /* ---- flat data of the sampling part (for queries and ports; not to be changed by callers) */
 
 /* 16 bytes. Inner: children child .. child + 3, number = (phi half) + 2 (z half); split[0] = share of the lower phi
-   half, split[1], split[2] = share of the lower z half in the lower, upper phi half. Leaf: child = 0; pdf in 1/sr, final;
-   x = lowest phi coordinate (24 bits) + depth << 24, y = lowest z coordinate (24 bits). */
+   half, split[1], split[2] = share of the lower z half in the lower, upper phi half. Leaf: child = 0; pdf in 1/sr,
+   final; x = lowest phi coordinate (24 bits) + depth << 24, y = lowest z coordinate (24 bits). */
 typedef union gsd_node {
     struct gsd_inner {
         uint32_t child;
@@ -412,9 +417,9 @@ GSD_API gsd_result gsd_merge(gsd_field *field, const gsd_field *source);
    than parents. Child number as in gsd_node. */
 typedef struct gsd_tree {
     uint32_t cell;
-    uint32_t count;    /* inner nodes */
-    uint32_t *child;   /* [count][4] */
-    float *value;      /* [count][4] */
+    uint32_t count;  /* inner nodes */
+    uint32_t *child; /* [count][4] */
+    float *value;    /* [count][4] */
 } gsd_tree;
 typedef enum gsd_part {
     GSD_PART_SAMPLING, /* learned density, without the uniform share; value sums to 1 over the leaves */
@@ -675,11 +680,9 @@ GSD_QUERY gsd_training_sample gsd_make_sample(const float position[3], const flo
    process in all arrays (NULL = 0 .. count - 1); strides are in bytes. u of find may be NULL, alpha (dense floats) of
    find may be NULL. Handles are dense. [any thread] */
 GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const float *positions,
-                            size_t position_stride, const float *u, size_t u_stride, gsd_handle *handles,
-                            float *alpha);
+                            size_t position_stride, const float *u, size_t u_stride, gsd_handle *handles, float *alpha);
 GSD_API void gsd_sample_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const gsd_handle *handles,
-                              const float *u, size_t u_stride, float *directions, size_t direction_stride,
-                              float *pdf);
+                              const float *u, size_t u_stride, float *directions, size_t direction_stride, float *pdf);
 GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const gsd_handle *handles,
                            const float *directions, size_t direction_stride, float *pdf);
 
@@ -728,22 +731,23 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #endif
 
 #define GSDI_NONE 0xffffffffu
-#define GSDI_GRID 4096u           /* 16^3 links */
-#define GSDI_JUMP_NODES 64u       /* a tree of more nodes than this has a jump table */
-#define GSDI_ROUND (1u << 18)     /* samples sorted at once */
-#define GSDI_SEGMENT 2048u        /* samples prepared at once */
-#define GSDI_STACK 96             /* of a walk through a quadtree: 3 * depth 20 + 4 is the most */
-#define GSDI_GATE_LOW 4           /* values of a below 1 at which V(a) is estimated */
-#define GSDI_MAX_VALUE 9.9e29     /* radiance or weight from here on is a bad sample */
-#define GSDI_MAX_ROOT 1e15        /* values are clamped to this before squaring */
-#define GSDI_CONFIDENCE 1.645     /* one-sided 95 % of the normal distribution */
-#define GSDI_MIN_EFFECTIVE 128.0  /* effective non-zero samples for the verdict "this tree does not pay"; fewer closes
-                                     cells whose light is rarely found */
-#define GSDI_MIN_EVEN 32.0        /* for "too even to pay" */
-#define GSDI_MIN_OPEN 4.0         /* for "pays" */
-#define GSDI_ENOUGH_HITS 256u      /* non-zero samples of a cell and pass; from then on the gate takes one of eight */
-#define GSDI_MIN_REBUILDS 3         /* before that verdict: the first trees are noise */
-#define GSDI_HISTORY 0.5          /* share of the sums kept where passes do not grow */
+#define GSDI_GRID 4096u       /* 16^3 links */
+#define GSDI_JUMP_NODES 64u   /* a tree of more nodes than this has a jump table */
+#define GSDI_ROUND (1u << 18) /* samples sorted at once */
+#define GSDI_SEGMENT 2048u    /* samples prepared at once */
+#define GSDI_STACK 96         /* of a walk through a quadtree: 3 * depth 20 + 4 is the most */
+#define GSDI_GATE_LOW 4       /* values of a below 1 at which V(a) is estimated */
+#define GSDI_MAX_VALUE 9.9e29 /* radiance or weight from here on is a bad sample */
+#define GSDI_MAX_ROOT 1e15    /* values are clamped to this before squaring */
+#define GSDI_CONFIDENCE 1.645 /* one-sided 95 % of the normal distribution */
+#define GSDI_MIN_EFFECTIVE                                                                                             \
+    128.0                     /* effective non-zero samples for the verdict "this tree does not pay"; fewer closes     \
+                                 cells whose light is rarely found */
+#define GSDI_MIN_EVEN 32.0    /* for "too even to pay" */
+#define GSDI_MIN_OPEN 4.0     /* for "pays" */
+#define GSDI_ENOUGH_HITS 256u /* non-zero samples of a cell and pass; from then on the gate takes one of eight */
+#define GSDI_MIN_REBUILDS 3   /* before that verdict: the first trees are noise */
+#define GSDI_HISTORY 0.5      /* share of the sums kept where passes do not grow */
 #define GSDI_MAX_CELLS (1u << 26)
 
 /* ---- >>memory ----------------------------------------------------------------------------------------------- */
@@ -791,14 +795,15 @@ static void gsdi_run(gsd_parallel_fn parallel, void *user, uint32_t count, uint3
 
 /* What building knows about a cell; saved as it is, so no padding. Sums are f64. */
 typedef struct gsdi_state {
-    double held;                      /* samples in the sums, those kept from earlier passes included */
-    double fresh;                     /* of this pass */
-    double gate_count;                /* samples that the gate has seen */
-    double v[GSDI_GATE_LOW + 1];      /* sum of x_a = contribution^2 / (p p_a); the last is a = 1 */
-    double vv[GSDI_GATE_LOW + 1];     /* sum of x_a^2 */
-    double cross[GSDI_GATE_LOW];      /* sum of x_a x_1 */
-    double weight;                    /* sum of contribution / p */
-    float theta, moment1, moment2;    /* Adam: alpha = sigmoid(theta) */
+    double held;                   /* samples in the sums, those kept from earlier passes included */
+    double fresh;                  /* of this pass */
+    double gate_count;             /* samples that the gate has seen */
+    double v[GSDI_GATE_LOW + 1];   /* sum of x_a = contribution^2 / (p p_a); the last is a = 1 */
+    double vv[GSDI_GATE_LOW + 1];  /* sum of x_a^2 */
+    double cross[GSDI_GATE_LOW];   /* sum of x_a x_1 */
+    double weight;                 /* sum of contribution / p */
+    double pixel, pixel_v;         /* sum of x_1 (pixel contribution / contribution)^2, and of x_1 beside it */
+    float theta, moment1, moment2; /* Adam: alpha = sigmoid(theta) */
     uint32_t steps;
     float alpha;    /* learned; what queries see is in gsd_cell */
     uint32_t gate;  /* GSD_GATE_... */
@@ -840,12 +845,13 @@ struct gsd_field {
     void *memory;      /* of block */
     gsdi_block *block; /* 64-byte aligned within memory */
     gsdi_state *states;
-    uint32_t *child;   /* building nodes: first child relative to the tree's root, 0 = leaf */
-    double *sum;       /* leaves: sums; inner nodes: scratch of refine */
+    uint32_t *child; /* building nodes: first child relative to the tree's root, 0 = leaf */
+    double *sum;     /* leaves: sums; inner nodes: scratch of refine */
     uint32_t building_nodes;
     uint32_t passes;
     double first_pass_samples, last_pass_samples;
     uint32_t first_pass_spp;
+    uint32_t pixels; /* the last pass had a pixel estimate */
     uint64_t structure;
     gsd_stats stats;
     uint32_t guiding; /* cells with alpha < 1 */
@@ -1176,11 +1182,11 @@ static uint32_t gsdi_refine_tree(const uint32_t *child, const double *sum, const
 
 /* What accumulate keeps of a sample while it sorts. 32 bytes. */
 typedef struct gsdi_item {
-    uint32_t x; /* 24-bit coordinate; bits 24 .. 29: index into gsdi_state.bins */
-    uint32_t y; /* 24-bit coordinate; bit 24: rejected before tracing */
+    uint32_t x;  /* 24-bit coordinate; bits 24 .. 29: index into gsdi_state.bins */
+    uint32_t y;  /* 24-bit coordinate; bit 24: rejected before tracing */
     float value; /* radiance, contribution or pixel contribution, as the target asks */
     float contribution, pdf_mix, pdf_bsdf, pdf_guide;
-    float weight; /* what goes into the quadtree */
+    float pixel; /* pixel contribution; then the weight that goes into the quadtree */
 } gsdi_item;
 
 typedef struct gsdi_segment {
@@ -1216,8 +1222,8 @@ static gsd_target gsdi_pass_target(const gsd_desc *desc, uint32_t pass)
 /* False where a sample is bad: not finite, negative, out of range, no density or no direction. */
 static bool gsdi_sample_valid(const gsd_training_sample *s)
 {
-    float length = s->direction[0] * s->direction[0] + s->direction[1] * s->direction[1] +
-                   s->direction[2] * s->direction[2];
+    float length =
+        s->direction[0] * s->direction[0] + s->direction[1] * s->direction[1] + s->direction[2] * s->direction[2];
     return length > 1e-12f && length < 1e12f && s->radiance >= 0 && (double)s->radiance < GSDI_MAX_VALUE &&
            s->contribution >= 0 && (double)s->contribution < GSDI_MAX_VALUE && s->pixel_contribution >= 0 &&
            (double)s->pixel_contribution < GSDI_MAX_VALUE && s->pdf_mix > 0 && gsdi_finite(s->pdf_mix) &&
@@ -1300,6 +1306,7 @@ static void gsdi_prepare(void *context, uint32_t begin, uint32_t end)
                                                            : s->pixel_contribution;
             item->value = rejected ? 0 : item->value;
             item->contribution = rejected ? 0 : s->contribution;
+            item->pixel = rejected ? 0 : s->pixel_contribution;
             item->pdf_mix = s->pdf_mix;
             item->pdf_bsdf = s->pdf_bsdf;
             item->pdf_guide = s->pdf_guide;
@@ -1333,9 +1340,9 @@ static void gsdi_adam(gsdi_state *state, double g, double p, double pb, double p
 
 /* Sums of the gate: x_a = g^2 / (p p_a) for each a. pb is floored, for a direction that was drawn by the guide but that
    the BSDF practically never draws. */
-static void gsdi_gate_add(gsdi_state *state, double g, double p, double pb, double pg)
+static void gsdi_gate_add(gsdi_state *state, double g, double pixel, double p, double pb, double pg)
 {
-    double q, x[GSDI_GATE_LOW + 1];
+    double w = pixel / g, q, x[GSDI_GATE_LOW + 1];
     int k;
     g = g < GSDI_MAX_ROOT ? g : GSDI_MAX_ROOT;
     q = g * (g / p);
@@ -1350,6 +1357,9 @@ static void gsdi_gate_add(gsdi_state *state, double g, double p, double pb, doub
     }
     for (k = 0; k < GSDI_GATE_LOW; ++k)
         state->cross[k] += x[k] * x[GSDI_GATE_LOW];
+    w = w < 1e15 ? w : 1e15;
+    state->pixel += w * w * x[GSDI_GATE_LOW];
+    state->pixel_v += x[GSDI_GATE_LOW];
 }
 
 /* Learn from one item in the cell where it lies; sets the weight that goes into the quadtree. */
@@ -1369,7 +1379,7 @@ static void gsdi_learn(const gsdi_accumulation *a, gsdi_state *state, const gsd_
         pg = (double)a->view.nodes[gsd_leaf_at(&a->view, handle, x, y)].leaf.pdf;
     if (judge && c > 0) {
         state->hits++;
-        gsdi_gate_add(state, c, p, pb, handle->root ? pg : pb); /* without a tree: neutral */
+        gsdi_gate_add(state, c, (double)item->pixel, p, pb, handle->root ? pg : pb); /* without a tree: neutral */
         if (handle->root && desc->alpha_mode == GSD_ALPHA_ADAM)
             gsdi_adam(state, c < GSDI_MAX_ROOT ? c : GSDI_MAX_ROOT, p, pb, pg, a->second_moment);
     }
@@ -1383,7 +1393,7 @@ static void gsdi_learn(const gsdi_accumulation *a, gsdi_state *state, const gsd_
         value *= value;
     }
     value /= p;
-    item->weight = (float)(value < 1e30 ? value : 1e30);
+    item->pixel = (float)(value < 1e30 ? value : 1e30);
 }
 
 static void gsdi_splat(const gsdi_accumulation *a, uint32_t cell, const gsdi_item *item)
@@ -1392,12 +1402,12 @@ static void gsdi_splat(const gsdi_accumulation *a, uint32_t cell, const gsdi_ite
     const uint32_t *child = a->field->child + state->first;
     double *sum = a->field->sum + state->first;
     uint32_t x = item->x & 0xffffffu, y = item->y & 0xffffffu, depth;
-    if (!(item->weight > 0))
+    if (!(item->pixel > 0))
         return;
     if (a->box)
-        gsdi_splat_box(child, sum, x, y, (double)item->weight);
+        gsdi_splat_box(child, sum, x, y, (double)item->pixel);
     else
-        sum[gsdi_building_leaf(child, x, y, &depth)] += (double)item->weight;
+        sum[gsdi_building_leaf(child, x, y, &depth)] += (double)item->pixel;
 }
 
 /* Busy cells [begin, end): statistics, and the quadtree sums where both belong to the same cell. */
@@ -1562,6 +1572,22 @@ static void gsdi_gate_difference(const gsdi_state *s, double f1, int a, double f
     *error = GSDI_CONFIDENCE * sqrt((square > 0 ? square : 0) / n);
 }
 
+/* Scale all sums of the gate. */
+static void gsdi_gate_scale(gsdi_state *s, double f)
+{
+    int k;
+    for (k = 0; k <= GSDI_GATE_LOW; ++k) {
+        s->v[k] *= f;
+        s->vv[k] *= f;
+    }
+    for (k = 0; k < GSDI_GATE_LOW; ++k)
+        s->cross[k] *= f;
+    s->weight *= f;
+    s->pixel *= f;
+    s->pixel_v *= f;
+    s->gate_count *= f;
+}
+
 /* Kish's effective number of samples behind V(1). */
 static double gsdi_gate_effective(const gsdi_state *s)
 {
@@ -1591,12 +1617,13 @@ static float gsdi_grid_alpha(const gsdi_state *s)
 }
 
 /* Open, close or leave a cell; see "Gate" in the opening comment. */
-static void gsdi_verdict(const gsd_desc *desc, gsdi_state *s, gsd_stats *stats)
+static void gsdi_verdict(const gsd_desc *desc, bool pixels, gsdi_state *s, gsd_stats *stats)
 {
     bool closed = s->gate == GSD_GATE_CLOSED;
     double n = gsdi_gate_effective(s), m = s->weight / s->gate_count, mean, error, even, even_error;
-    double margin = (double)desc->gate_margin * (closed ? 2 : 1), need = (double)desc->gate_gain * m * m;
-    double limit = (1 + (double)desc->gate_gain) * m * m;
+    double margin = (double)desc->gate_margin * (closed ? 2 : 1),
+           need = (double)desc->gate_gain * (pixels && s->pixel > 0 ? s->pixel_v / s->pixel : 16 * m * m);
+    double limit = m * m + need;
     int k, best = 0;
     stats->probed += closed;
     for (k = 1; k < GSDI_GATE_LOW; ++k)
@@ -1616,10 +1643,11 @@ static void gsdi_verdict(const gsd_desc *desc, gsdi_state *s, gsd_stats *stats)
     }
 }
 
-/* Verdict on a cell after a pass; fades its sums. */
-static void gsdi_judge(const gsd_desc *desc, gsdi_state *s, gsd_stats *stats)
+/* Verdict on a cell after a pass; fades its sums. changed: pixels are true now and were not before, or the reverse. */
+static void gsdi_judge(const gsd_desc *desc, bool pixels, bool changed, gsdi_state *s, gsd_stats *stats)
 {
-    int k;
+    if (changed)
+        s->pixel = s->pixel_v = 0;
     if (s->gate == GSD_GATE_CLOSED && s->probe > 0) {
         s->probe--;
         return;
@@ -1629,17 +1657,10 @@ static void gsdi_judge(const gsd_desc *desc, gsdi_state *s, gsd_stats *stats)
     else if (desc->alpha_mode == GSD_ALPHA_ADAM)
         s->alpha = 1 / (1 + expf(-s->theta));
     if (!desc->no_gate && s->gate_count > 0 && gsdi_gate_effective(s) > 0)
-        gsdi_verdict(desc, s, stats);
+        gsdi_verdict(desc, pixels, s, stats);
     if (s->gate == GSD_GATE_CLOSED)
         s->probe = desc->gate_probe - 1;
-    for (k = 0; k <= GSDI_GATE_LOW; ++k) {
-        s->v[k] *= 0.5;
-        s->vv[k] *= 0.5;
-        if (k < GSDI_GATE_LOW)
-            s->cross[k] *= 0.5;
-    }
-    s->gate_count *= 0.5;
-    s->weight *= 0.5;
+    gsdi_gate_scale(s, 0.5);
 }
 
 /* ---- >>block ------------------------------------------------------------------------------------------------ */
@@ -2231,14 +2252,7 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
             for (k = 0; k < 64; ++k)
                 s->bins[k] = p->level == old->level ? (uint32_t)((double)old->bins[k] * r->keep) : 0;
             share = share < 0.01 ? 0.01 : share;
-            for (k = 0; k <= GSDI_GATE_LOW; ++k) {
-                s->v[k] *= share;
-                s->vv[k] *= share;
-                if (k < GSDI_GATE_LOW)
-                    s->cross[k] *= share;
-            }
-            s->gate_count *= share;
-            s->weight *= share;
+            gsdi_gate_scale(s, share);
         }
         if (r->clear) { /* another target: what waits is of no use */
             s->held = 0;
@@ -2346,19 +2360,23 @@ static void gsdi_field_changed(gsd_field *field)
 }
 
 /* The gate's verdicts, and how the pass's samples are spread over them. */
-static void gsdi_judge_cells(gsdi_refinement *r, double samples)
+static void gsdi_judge_cells(gsdi_refinement *r, const gsd_pass *pass, double samples)
 {
+    bool pixels = pass && pass->pixel_estimate, changed = r->field->passes > 0 && pixels != (r->field->pixels != 0);
     double closed = 0, alpha = 0;
     uint32_t i;
     for (i = 0; i < r->field->block->cells; ++i) {
         gsdi_state *s = &r->field->states[i];
         if (s->fresh > 0)
-            gsdi_judge(r->desc, s, &r->stats);
+            gsdi_judge(r->desc, pixels, changed, s, &r->stats);
         closed += s->gate == GSD_GATE_CLOSED ? s->fresh : 0;
         alpha += s->gate == GSD_GATE_CLOSED ? s->fresh : s->fresh * (double)s->alpha;
     }
-    r->stats.closed_share = samples > 0 ? (float)(closed / samples) : 0;
-    r->stats.mean_alpha = samples > 0 ? (float)(alpha / samples) : 1;
+    r->field->pixels = pixels;
+    if (samples > 0) {
+        r->stats.closed_share = (float)(closed / samples);
+        r->stats.mean_alpha = (float)(alpha / samples);
+    }
 }
 
 /* Make the new parts the field's, free the old. */
@@ -2418,7 +2436,7 @@ GSD_API gsd_result gsd_refine(gsd_field *field, const gsd_pass *pass, gsd_parall
         return GSD_OUT_OF_MEMORY;
     }
     /* nothing can fail from here */
-    gsdi_judge_cells(&r, samples);
+    gsdi_judge_cells(&r, pass, samples);
     gsdi_block_uniform(r.block);
     memcpy(gsdi_words(r.block, r.block->spatial_at), r.spatial, r.spatial_count * sizeof(uint32_t));
     gsdi_block_grid(r.block);
@@ -2429,7 +2447,7 @@ GSD_API gsd_result gsd_refine(gsd_field *field, const gsd_pass *pass, gsd_parall
     return GSD_OK;
 }
 
-/* ---- field: options, life and statistics */
+/* ---- >>life ------------------------------------------------------------------------------------------------- */
 
 GSD_API const char *gsd_result_string(gsd_result result)
 {
@@ -2498,7 +2516,7 @@ GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
     gsdi_default_float(&d.alpha, 0.5f);
     gsdi_default_float(&d.uniform, 0.01f);
     gsdi_default_float(&d.gate_margin, 0.05f);
-    gsdi_default_float(&d.gate_gain, 4);
+    gsdi_default_float(&d.gate_gain, 0.25f);
     gsdi_default_u32(&d.gate_probe, 1);
     if ((unsigned)d.target > GSD_TARGET_SWITCHING || (unsigned)d.spatial_filter > GSD_SPATIAL_STOCHASTIC ||
         (unsigned)d.directional_filter > GSD_DIRECTIONAL_BOX || (unsigned)d.alpha_mode > GSD_ALPHA_GRID ||
@@ -2511,7 +2529,8 @@ GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
         !gsdi_within((double)d.rho, 0.99e-5, 1) || !gsdi_within(d.max_depth, 1, 20) ||
         !gsdi_within(d.max_levels, 1, 60) || !gsdi_within((double)d.alpha, 0.0499, 1) ||
         !gsdi_within((double)d.uniform, 0.99e-4, 1) || !gsdi_within((double)d.gate_margin, 0.99e-3, 10) ||
-        !gsdi_within((double)d.gate_gain, 0.99e-3, 1000) || !gsdi_within(d.gate_probe, 1, 1000) || d.max_bytes < 1u << 20 || d.forest_cells > GSDI_MAX_CELLS)
+        !gsdi_within((double)d.gate_gain, 0.99e-4, 1000) || !gsdi_within(d.gate_probe, 1, 1000) ||
+        d.max_bytes < 1u << 20 || d.forest_cells > GSDI_MAX_CELLS)
         return GSD_BAD_RANGE;
     if (!d.forest_cells && !gsdi_bounds_ok(&d))
         return GSD_BAD_BOUNDS;
@@ -2759,14 +2778,7 @@ GSD_API gsd_result gsd_forest_split(gsd_field *field, uint32_t parent, uint32_t 
         field->sum[s->first + i] *= 0.5;
     s->held *= 0.5;
     s->fresh *= 0.5;
-    s->gate_count *= 0.5;
-    s->weight *= 0.5;
-    for (k = 0; k <= GSDI_GATE_LOW; ++k) {
-        s->v[k] *= 0.5;
-        s->vv[k] *= 0.5;
-        if (k < GSDI_GATE_LOW)
-            s->cross[k] *= 0.5;
-    }
+    gsdi_gate_scale(s, 0.5);
     children[0] = child_a;
     children[1] = child_b;
     for (k = 0; k < 2; ++k)
@@ -2797,8 +2809,7 @@ static float *gsdi_row_out(float *base, size_t stride, uint32_t row)
 }
 
 GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const float *positions,
-                            size_t position_stride, const float *u, size_t u_stride, gsd_handle *handles,
-                            float *alpha)
+                            size_t position_stride, const float *u, size_t u_stride, gsd_handle *handles, float *alpha)
 {
     uint32_t start, i, axis;
     for (start = 0; start < count; start += GSDI_LANES) {
@@ -2963,7 +2974,8 @@ static void gsdi_draw_alias(const gsd_view *view, gsdi_draw *d)
 #if GSDI_X86
 #define GSDI_AVX2 __attribute__((target("avx2")))
 
-/* Sixteen draws as arrays. The steps are those of gsd_sample, in the same operations, so results are equal bit by bit. */
+/* Sixteen draws as arrays. The steps are those of gsd_sample, in the same operations, so results are equal bit by bit.
+ */
 typedef struct gsdi_draws {
     double r[2][GSDI_LANES], lo[2][GSDI_LANES], width[2][GSDI_LANES];
     uint32_t bits[2][GSDI_LANES]; /* of u, 24 each; then extended to 32 */
@@ -2987,18 +2999,19 @@ GSDI_AVX2 static void gsdi_extend_avx2(gsdi_draws *d, double e)
     for (i = 0; i < GSDI_LANES; i += 4) {
         __m128i a = _mm_loadu_si128((const __m128i *)(const void *)&d->bits[0][i]);
         __m128i b = _mm_loadu_si128((const __m128i *)(const void *)&d->bits[1][i]), h, low = _mm_set1_epi32(255);
-        h = _mm_xor_si128(_mm_mullo_epi32(a, _mm_set1_epi32((int)0x9e3779b1u)),
-                          _mm_add_epi32(_mm_mullo_epi32(b, _mm_set1_epi32((int)0x85ebca6bu)),
-                                        _mm_set1_epi32(0x27d4eb2f)));
+        h = _mm_xor_si128(
+            _mm_mullo_epi32(a, _mm_set1_epi32((int)0x9e3779b1u)),
+            _mm_add_epi32(_mm_mullo_epi32(b, _mm_set1_epi32((int)0x85ebca6bu)), _mm_set1_epi32(0x27d4eb2f)));
         h = _mm_mullo_epi32(_mm_xor_si128(h, _mm_srli_epi32(h, 15)), _mm_set1_epi32(0x2c1b3c6d));
         h = _mm_xor_si128(h, _mm_srli_epi32(h, 13));
         a = _mm_or_si128(_mm_slli_epi32(a, 8), _mm_and_si128(h, low));
         b = _mm_or_si128(_mm_slli_epi32(b, 8), _mm_and_si128(_mm_srli_epi32(h, 8), low));
         _mm256_storeu_pd(&d->r[1][i], _mm256_mul_pd(gsdi_u32_double(b), scale));
-        _mm256_storeu_pd(&d->r[0][i], _mm256_min_pd(_mm256_div_pd(_mm256_sub_pd(_mm256_mul_pd(gsdi_u32_double(a), scale),
-                                                                                _mm256_set1_pd(e)),
-                                                                  _mm256_set1_pd(1 - e)),
-                                                    _mm256_set1_pd(0.99999999988)));
+        _mm256_storeu_pd(
+            &d->r[0][i],
+            _mm256_min_pd(_mm256_div_pd(_mm256_sub_pd(_mm256_mul_pd(gsdi_u32_double(a), scale), _mm256_set1_pd(e)),
+                                        _mm256_set1_pd(1 - e)),
+                          _mm256_set1_pd(0.99999999988)));
     }
 }
 
@@ -3008,9 +3021,9 @@ GSDI_AVX2 static void gsdi_nodes_avx2(const gsd_node *nodes, const uint32_t *nod
     __m256 row[4], t[4];
     uint32_t i;
     for (i = 0; i < 4; ++i)
-        row[i] = _mm256_insertf128_ps(
-            _mm256_castps128_ps256(_mm_loadu_ps((const float *)(const void *)&nodes[node[i]])),
-            _mm_loadu_ps((const float *)(const void *)&nodes[node[i + 4]]), 1);
+        row[i] =
+            _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps((const float *)(const void *)&nodes[node[i]])),
+                                 _mm_loadu_ps((const float *)(const void *)&nodes[node[i + 4]]), 1);
     t[0] = _mm256_unpacklo_ps(row[0], row[1]);
     t[1] = _mm256_unpackhi_ps(row[0], row[1]);
     t[2] = _mm256_unpacklo_ps(row[2], row[3]);
@@ -3028,8 +3041,7 @@ GSDI_AVX2 static __m256d gsdi_narrow_avx2(const double *r, double *lo, double *w
     __m256d middle = _mm256_add_pd(l, w), upper;
     upper = _mm256_and_pd(_mm256_cmp_pd(_mm256_loadu_pd(r), middle, _CMP_GE_OQ), _mm256_cmp_pd(w, full, _CMP_LT_OQ));
     _mm256_storeu_pd(lo, _mm256_blendv_pd(l, middle, _mm256_and_pd(upper, active)));
-    _mm256_storeu_pd(width,
-                     _mm256_blendv_pd(full, _mm256_blendv_pd(w, _mm256_sub_pd(full, w), upper), active));
+    _mm256_storeu_pd(width, _mm256_blendv_pd(full, _mm256_blendv_pd(w, _mm256_sub_pd(full, w), upper), active));
     return upper;
 }
 
@@ -3054,8 +3066,8 @@ GSDI_AVX2 static bool gsdi_step_avx2(const gsd_view *view, gsdi_draws *d, uint32
         return false;
     for (half = 0; half < 2; ++half) {
         uint32_t at = lane + half * 4;
-        __m256d act = _mm256_castsi256_pd(_mm256_cvtepi32_epi64(
-            half ? _mm256_extracti128_si256(active, 1) : _mm256_castsi256_si128(active)));
+        __m256d act = _mm256_castsi256_pd(
+            _mm256_cvtepi32_epi64(half ? _mm256_extracti128_si256(active, 1) : _mm256_castsi256_si128(active)));
         __m256d s0 = _mm256_cvtps_pd(half ? _mm256_extractf128_ps(column[1], 1) : _mm256_castps256_ps128(column[1]));
         __m256d s1 = _mm256_cvtps_pd(half ? _mm256_extractf128_ps(column[2], 1) : _mm256_castps256_ps128(column[2]));
         __m256d s2 = _mm256_cvtps_pd(half ? _mm256_extractf128_ps(column[3], 1) : _mm256_castps256_ps128(column[3]));
@@ -3065,8 +3077,8 @@ GSDI_AVX2 static bool gsdi_step_avx2(const gsd_view *view, gsdi_draws *d, uint32
         by[half] = gsdi_mask_avx2(y);
     }
     next = _mm256_sub_epi32(child, _mm256_inserti128_si256(_mm256_castsi128_si256(bx[0]), bx[1], 1));
-    next = _mm256_sub_epi32(next,
-                            _mm256_slli_epi32(_mm256_inserti128_si256(_mm256_castsi128_si256(by[0]), by[1], 1), 1));
+    next =
+        _mm256_sub_epi32(next, _mm256_slli_epi32(_mm256_inserti128_si256(_mm256_castsi128_si256(by[0]), by[1], 1), 1));
     next = _mm256_blendv_epi8(_mm256_loadu_si256((const __m256i *)(const void *)&d->node[lane]), next, active);
     _mm256_storeu_si256((__m256i *)(void *)&d->node[lane], next);
     for (i = 0; i < 8; ++i)
@@ -3091,7 +3103,8 @@ GSDI_AVX2 static void gsdi_leaves_avx2(const gsd_view *view, gsdi_draws *d, uint
         corner[1] = _mm256_cvtepi32_pd(y);
         for (k = 0; k < 2; ++k) {
             __m256d t = _mm256_div_pd(_mm256_sub_pd(_mm256_loadu_pd(&d->r[k][at]), _mm256_loadu_pd(&d->lo[k][at])),
-                                      _mm256_loadu_pd(&d->width[k][at])), f;
+                                      _mm256_loadu_pd(&d->width[k][at])),
+                    f;
             t = _mm256_max_pd(t, _mm256_setzero_pd());
             f = _mm256_mul_pd(_mm256_min_pd(t, _mm256_set1_pd(0.99999999988)), size);
             edge = _mm256_or_pd(edge, _mm256_cmp_pd(f, _mm256_set1_pd(2), _CMP_LT_OQ));
@@ -3113,11 +3126,11 @@ GSDI_AVX2 static void gsdi_directions_avx2(gsdi_draws *d, uint32_t lane)
     for (half = 0; half < 2; ++half) {
         __m256d turn = _mm256_mul_pd(_mm256_loadu_pd(&d->r[0][lane + half * 4]), _mm256_set1_pd(5.9604644775390625e-8));
         qh[half] = _mm256_cvttpd_epi32(_mm256_add_pd(_mm256_mul_pd(turn, _mm256_set1_pd(4)), _mm256_set1_pd(0.5)));
-        fh[half] = _mm256_cvtpd_ps(
-            _mm256_sub_pd(turn, _mm256_mul_pd(_mm256_set1_pd(0.25), _mm256_cvtepi32_pd(qh[half]))));
-        zh[half] = _mm256_cvtpd_ps(_mm256_sub_pd(_mm256_mul_pd(_mm256_loadu_pd(&d->r[1][lane + half * 4]),
-                                                               _mm256_set1_pd(1.1920928955078125e-7)),
-                                                 _mm256_set1_pd(1)));
+        fh[half] =
+            _mm256_cvtpd_ps(_mm256_sub_pd(turn, _mm256_mul_pd(_mm256_set1_pd(0.25), _mm256_cvtepi32_pd(qh[half]))));
+        zh[half] = _mm256_cvtpd_ps(_mm256_sub_pd(
+            _mm256_mul_pd(_mm256_loadu_pd(&d->r[1][lane + half * 4]), _mm256_set1_pd(1.1920928955078125e-7)),
+            _mm256_set1_pd(1)));
     }
     f = _mm256_insertf128_ps(_mm256_castps128_ps256(fh[0]), fh[1], 1);
     z = _mm256_insertf128_ps(_mm256_castps128_ps256(zh[0]), zh[1], 1);
@@ -3247,24 +3260,47 @@ GSD_API void gsd_sample_batch(const gsd_view *view, uint32_t count, const uint32
 
 /* ---- >>files ------------------------------------------------------------------------------------------------ */
 
+/* Options in a save: X(type, name, type in gsd_desc). */
+#define GSDI_OPTIONS(X)                                                                                                \
+    X(uint64_t, max_bytes, uint64_t)                                                                                   \
+    X(uint32_t, target, gsd_target)                                                                                    \
+    X(uint32_t, switch_pass, uint32_t)                                                                                 \
+    X(uint32_t, max_depth, uint32_t)                                                                                   \
+    X(uint32_t, max_levels, uint32_t)                                                                                  \
+    X(uint32_t, min_samples, uint32_t)                                                                                 \
+    X(uint32_t, spatial_filter, gsd_spatial_filter)                                                                    \
+    X(uint32_t, directional_filter, gsd_directional_filter)                                                            \
+    X(uint32_t, alpha_mode, gsd_alpha_mode)                                                                            \
+    X(uint32_t, gate_probe, uint32_t)                                                                                  \
+    X(uint32_t, forest_cells, uint32_t)                                                                                \
+    X(uint32_t, no_gate, bool)                                                                                         \
+    X(uint32_t, no_guide_weight, bool)                                                                                 \
+    X(uint32_t, no_history, bool)                                                                                      \
+    X(uint32_t, alias, bool)                                                                                           \
+    X(float, split_samples, float)                                                                                     \
+    X(float, rho, float)                                                                                               \
+    X(float, alpha, float)                                                                                             \
+    X(float, uniform, float)                                                                                           \
+    X(float, gate_margin, float)                                                                                       \
+    X(float, gate_gain, float)
+
+#define GSDI_MAGIC "GSDTREE"
+#define GSDI_BYTE_ORDER 0x01020304u
+
 /* Start of a save. Then gsdi_block and what follows it, states, child, sum. */
+#define GSDI_MEMBER(type, name, given) type name;
 typedef struct gsdi_file {
     char magic[8];
     uint32_t byte_order, version;
     uint64_t size, checksum; /* of the whole save with checksum = 0 */
     uint64_t block_size, structure;
-    uint64_t samples, zeros, rejected, refused, clamped, lost, opened, closed, probed, peak_bytes, max_bytes;
     double first_pass_samples, last_pass_samples;
-    uint32_t cells, building_nodes, passes, first_pass_spp;
-    uint32_t target, switch_pass, max_depth, max_levels, min_samples, spatial_filter, directional_filter, alpha_mode;
-    uint32_t no_gate, no_guide_weight, no_history, alias, gate_probe, forest_cells;
+    gsd_stats stats; /* plain numbers without padding */
+    uint32_t cells, building_nodes, passes, first_pass_spp, pixels;
     float bounds_min[3], bounds_max[3];
-    float split_samples, rho, alpha, uniform, gate_margin, gate_gain, closed_share, mean_alpha, effective_rho;
-    uint32_t reserved;
+    GSDI_OPTIONS(GSDI_MEMBER)
 } gsdi_file;
-
-#define GSDI_MAGIC "GSDTREE"
-#define GSDI_BYTE_ORDER 0x01020304u
+#undef GSDI_MEMBER
 
 static uint64_t gsdi_file_size(uint64_t block_size, uint64_t cells, uint64_t nodes)
 {
@@ -3279,59 +3315,16 @@ GSD_API size_t gsd_save_bound(const gsd_field *field)
     return (size_t)gsdi_file_size(gsdi_block_used(field->block), field->block->cells, field->building_nodes);
 }
 
-static void gsdi_file_options(gsdi_file *f, const gsd_desc *d)
-{
-    f->target = (uint32_t)d->target;
-    f->switch_pass = d->switch_pass;
-    f->max_depth = d->max_depth;
-    f->max_levels = d->max_levels;
-    f->min_samples = d->min_samples;
-    f->spatial_filter = (uint32_t)d->spatial_filter;
-    f->directional_filter = (uint32_t)d->directional_filter;
-    f->alpha_mode = (uint32_t)d->alpha_mode;
-    f->no_gate = d->no_gate;
-    f->no_guide_weight = d->no_guide_weight;
-    f->no_history = d->no_history;
-    f->alias = d->alias;
-    f->gate_probe = d->gate_probe;
-    f->forest_cells = d->forest_cells;
-    f->max_bytes = d->max_bytes;
-    memcpy(f->bounds_min, d->bounds_min, sizeof f->bounds_min);
-    memcpy(f->bounds_max, d->bounds_max, sizeof f->bounds_max);
-    f->split_samples = d->split_samples;
-    f->rho = d->rho;
-    f->alpha = d->alpha;
-    f->uniform = d->uniform;
-    f->gate_margin = d->gate_margin;
-    f->gate_gain = d->gate_gain;
-}
-
 static gsd_result gsdi_file_desc(const gsdi_file *f, const gsd_desc *given, gsd_desc *d)
 {
     memset(d, 0, sizeof *d);
-    d->target = (gsd_target)(f->target & 0xffu);
-    d->switch_pass = f->switch_pass;
-    d->max_depth = f->max_depth;
-    d->max_levels = f->max_levels;
-    d->min_samples = f->min_samples;
-    d->spatial_filter = (gsd_spatial_filter)(f->spatial_filter & 0xffu);
-    d->directional_filter = (gsd_directional_filter)(f->directional_filter & 0xffu);
-    d->alpha_mode = (gsd_alpha_mode)(f->alpha_mode & 0xffu);
-    d->no_gate = f->no_gate != 0;
-    d->no_guide_weight = f->no_guide_weight != 0;
-    d->no_history = f->no_history != 0;
-    d->alias = f->alias != 0;
-    d->gate_probe = f->gate_probe;
-    d->forest_cells = f->forest_cells;
-    d->max_bytes = f->max_bytes;
+#define GSDI_READ(type, name, given_type) d->name = (given_type)f->name;
+    if (f->target > 255 || f->spatial_filter > 255 || f->directional_filter > 255 || f->alpha_mode > 255)
+        return GSD_BAD_OPTION;
+    GSDI_OPTIONS(GSDI_READ)
+#undef GSDI_READ
     memcpy(d->bounds_min, f->bounds_min, sizeof d->bounds_min);
     memcpy(d->bounds_max, f->bounds_max, sizeof d->bounds_max);
-    d->split_samples = f->split_samples;
-    d->rho = f->rho;
-    d->alpha = f->alpha;
-    d->uniform = f->uniform;
-    d->gate_margin = f->gate_margin;
-    d->gate_gain = f->gate_gain;
     if (given) {
         d->allocate = given->allocate;
         d->release = given->release;
@@ -3339,41 +3332,6 @@ static gsd_result gsdi_file_desc(const gsdi_file *f, const gsd_desc *given, gsd_
         d->simd = given->simd;
     }
     return gsd_resolve(d, d);
-}
-
-static void gsdi_file_counters(gsdi_file *f, const gsd_stats *s)
-{
-    f->samples = s->samples;
-    f->zeros = s->zeros;
-    f->rejected = s->rejected;
-    f->refused = s->refused;
-    f->clamped = s->clamped;
-    f->lost = s->lost;
-    f->opened = s->opened;
-    f->closed = s->closed;
-    f->probed = s->probed;
-    f->peak_bytes = s->peak_bytes;
-    f->closed_share = s->closed_share;
-    f->mean_alpha = s->mean_alpha;
-    f->effective_rho = s->effective_rho;
-}
-
-static void gsdi_counters_file(gsd_stats *s, const gsdi_file *f)
-{
-    s->samples = f->samples;
-    s->zeros = f->zeros;
-    s->rejected = f->rejected;
-    s->refused = f->refused;
-    s->clamped = f->clamped;
-    s->lost = f->lost;
-    s->opened = f->opened;
-    s->closed = f->closed;
-    s->probed = f->probed;
-    s->peak_bytes = f->peak_bytes;
-    s->closed_share = f->closed_share;
-    s->mean_alpha = f->mean_alpha;
-    s->effective_rho = f->effective_rho;
-    s->passes = f->passes;
 }
 
 static uint64_t gsdi_file_checksum(const gsdi_file *f, const unsigned char *rest, size_t rest_size)
@@ -3414,8 +3372,13 @@ GSD_API gsd_result gsd_save(const gsd_field *field, void *data, size_t capacity,
     f.building_nodes = nodes;
     f.passes = field->passes;
     f.first_pass_spp = field->first_pass_spp;
-    gsdi_file_options(&f, &field->desc);
-    gsdi_file_counters(&f, &field->stats);
+    f.pixels = field->pixels;
+    f.stats = field->stats;
+    memcpy(f.bounds_min, field->desc.bounds_min, sizeof f.bounds_min);
+    memcpy(f.bounds_max, field->desc.bounds_max, sizeof f.bounds_max);
+#define GSDI_WRITE(type, name, given) f.name = (type)field->desc.name;
+    GSDI_OPTIONS(GSDI_WRITE)
+#undef GSDI_WRITE
     shape.cell_capacity = shape.cells;
     shape.size = f.block_size;
     at = gsdi_put(at, &f, sizeof f);
@@ -3503,9 +3466,10 @@ GSD_API gsd_result gsd_load(const gsd_desc *desc, const void *data, size_t size,
     field->state_capacity = f.cells;
     field->passes = f.passes;
     field->first_pass_spp = f.first_pass_spp;
+    field->pixels = f.pixels;
     field->first_pass_samples = f.first_pass_samples;
     field->last_pass_samples = f.last_pass_samples;
-    gsdi_counters_file(&field->stats, &f);
+    field->stats = f.stats;
     if (gsd_validate(field)) {
         gsd_destroy(field);
         return GSD_BAD_FILE;
@@ -3516,7 +3480,7 @@ GSD_API gsd_result gsd_load(const gsd_desc *desc, const void *data, size_t size,
     return GSD_OK;
 }
 
-/* ---- validation */
+/* ---- >>check ------------------------------------------------------------------------------------------------ */
 
 static bool gsdi_share_ok(float x) { return x >= 0 && x <= 1; }
 
@@ -3674,8 +3638,8 @@ static bool gsdi_state_ok(const gsd_field *field, const gsdi_state *s, const gsd
     if (c->tree >= field->block->trees || s->gate > GSD_GATE_CLOSED || !(s->alpha >= 0.049f && s->alpha <= 1) ||
         !(s->theta > -10 && s->theta < 10) || !gsdi_finite(s->moment1) || !gsdi_finite(s->moment2) ||
         !(s->held >= 0 && s->held < 1e18) || !(s->fresh >= 0 && s->fresh < 1e18) || !(s->gate_count >= 0) ||
-        !(s->weight >= 0 && s->weight < 1e300) ||
-        s->level > 60)
+        !(s->weight >= 0 && s->weight < 1e300) || !(s->pixel >= 0 && s->pixel < 1e300) ||
+        !(s->pixel_v >= 0 && s->pixel_v < 1e300) || s->level > 60)
         return false;
     for (k = 0; k <= GSDI_GATE_LOW; ++k)
         if (!(s->v[k] >= 0 && s->v[k] < 1e300) || !(s->vv[k] >= 0 && s->vv[k] < 1e300))
@@ -3714,7 +3678,7 @@ GSD_API gsd_result gsd_validate(const gsd_field *field)
     return gsdi_spatial_ok(field, &view) ? GSD_OK : GSD_CORRUPT;
 }
 
-/* ---- merge, export, import */
+/* ---- >>plain: merge, export, import ------------------------------------------------------------------------- */
 
 GSD_API gsd_result gsd_merge(gsd_field *field, const gsd_field *source)
 {
@@ -3733,6 +3697,8 @@ GSD_API gsd_result gsd_merge(gsd_field *field, const gsd_field *source)
         s->fresh += o->fresh;
         s->gate_count += o->gate_count;
         s->weight += o->weight;
+        s->pixel += o->pixel;
+        s->pixel_v += o->pixel_v;
         s->theta += (float)(share * ((double)o->theta - (double)s->theta));
         for (k = 0; k <= GSDI_GATE_LOW; ++k) {
             s->v[k] += o->v[k];
@@ -3955,9 +3921,9 @@ GSD_API gsd_result gsd_import_trees(gsd_field *field, const gsd_tree *trees, uin
 
    Permission is hereby granted, free of charge, to any person obtaining a copy of this software and associated
    documentation files (the "Software"), to deal in the Software without restriction, including without limitation the
-   rights to use, copy, modify, merge, publish, distribute, sublicense, and/or sell copies of the Software, and to permit
-   persons to whom the Software is furnished to do so, subject to the following conditions: the above copyright notice
-   and this permission notice shall be included in all copies or substantial portions of the Software.
+   rights to use, copy, modify, merge, publish, distribute, sublicense, and/or sell copies of the Software, and to
+   permit persons to whom the Software is furnished to do so, subject to the following conditions: the above copyright
+   notice and this permission notice shall be included in all copies or substantial portions of the Software.
 
    THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR IMPLIED, INCLUDING BUT NOT LIMITED TO THE
    WARRANTIES OF MERCHANTABILITY, FITNESS FOR A PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE AUTHORS OR

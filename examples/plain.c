@@ -55,8 +55,9 @@ static void scatter(int axis, float side, float d[3])
     d[(axis + 2) % 3] = r * sinf(phi);
 }
 
-/* Light leaving p, on a surface with normal side * axis. Learns into stream, if there is one. */
-static float radiance(float p[3], int axis, float side, const gsd_view *field, gsd_stream *stream)
+/* Light leaving p, on a surface with normal side * axis. Learns into stream, if there is one; weight = 1 / estimate of
+   the pixel's value. */
+static float radiance(float p[3], int axis, float side, float weight, const gsd_view *field, gsd_stream *stream)
 {
     gsd_training_sample vertex[DEPTH];
     float emitted[DEPTH], cosine[DEPTH], light = 0;
@@ -72,7 +73,8 @@ static float radiance(float p[3], int axis, float side, const gsd_view *field, g
         float pdf_bsdf = fmaxf(d[axis] * side, 0) / 3.14159265f;
         float pdf = alpha < 1 ? alpha * pdf_bsdf + (1 - alpha) * pdf_guide : pdf_bsdf;
         cosine[n] = d[axis] * side;
-        vertex[n] = gsd_make_scalar_sample(p, d, cosine[n] > 0 ? 0 : GSD_REJECTED, 0, 0, pdf, pdf_bsdf, pdf_guide);
+        vertex[n] = gsd_make_scalar_sample(p, d, cosine[n] > 0 ? 0 : GSD_REJECTED, 0, weight, pdf, pdf_bsdf, pdf_guide);
+        weight *= ALBEDO / 3.14159265f * cosine[n] / pdf;
         emitted[n++] = 0;
         if (!(cosine[n - 1] > 0) || !(pdf > 0)) /* into the wall */
             break;
@@ -83,7 +85,8 @@ static float radiance(float p[3], int axis, float side, const gsd_view *field, g
         float fcos = ALBEDO / 3.14159265f * fmaxf(cosine[i], 0), arriving = emitted[i] + light;
         if (cosine[i] > 0)
             vertex[i].radiance = arriving;
-        vertex[i].contribution = vertex[i].pixel_contribution = arriving * fcos;
+        vertex[i].contribution = arriving * fcos;
+        vertex[i].pixel_contribution *= arriving * fcos;
         light = vertex[i].pdf_mix > 0 ? arriving * fcos / vertex[i].pdf_mix : 0;
     }
     if (stream)
@@ -94,24 +97,23 @@ static float radiance(float p[3], int axis, float side, const gsd_view *field, g
 /* Render all passes into image; returns the variance of the mean pixel at the end. */
 static double render(float *image, gsd_field *field, gsd_stream *stream)
 {
-    double weights = 0;
+    double weights = 0, mean = 0;
     for (int pass = 0; pass < PASSES; ++pass) {
         static float picture[SIZE * SIZE];
         gsd_view view = gsd_get_view(field);
-        double variance = 0;
-        int paths = 2 << pass;
+        gsd_pass info = {.spp = 2u << pass, .pixel_estimate = pass > 0};
+        double variance = 0, weight = pass ? pass / mean : 1, paths = 2 << pass; /* estimate: the floor's mean */
         for (int i = 0; i < SIZE * SIZE; ++i) {
             double sum = 0, square = 0;
             for (int k = 0; k < paths; ++k) {
-                float p[3] = {((float)(i % SIZE) + random_float()) / SIZE, ((float)(i / SIZE) + random_float()) / SIZE,
-                              0};
-                float L = radiance(p, 2, 1, &view, stream);
+                float x = (float)(i % SIZE) + random_float(), y = (float)(i / SIZE) + random_float();
+                float p[3] = {x / SIZE, y / SIZE, 0}, L = radiance(p, 2, 1, (float)weight, &view, stream);
                 sum += L;
                 square += (double)L * L;
             }
             sum /= paths;
-            picture[i] = (float)sum;
-            variance += (square / (paths)-sum * sum) / (paths - 1) / (SIZE * SIZE);
+            mean += (picture[i] = (float)sum) / (SIZE * SIZE);
+            variance += (square / paths - sum * sum) / (paths - 1) / (SIZE * SIZE);
         }
         for (int i = 0; i < SIZE * SIZE; ++i) /* one weight per pass: the pictures stay unbiased */
             image[i] = (float)((weights * image[i] + picture[i] / variance) / (weights + 1 / variance));
@@ -119,10 +121,9 @@ static double render(float *image, gsd_field *field, gsd_stream *stream)
         if (stream) {
             gsd_accumulate(field, &stream, 1, NULL, NULL);
             gsd_stream_clear(stream);
-            gsd_refine(field, NULL, NULL, NULL);
+            gsd_refine(field, &info, NULL, NULL);
         }
-        printf("%s: %3d paths per pixel, variance * paths %.4g\n", stream ? "guided  " : "unguided", paths,
-               variance * paths);
+        printf("%s: %3g paths, variance of one %.4g\n", stream ? "guided  " : "unguided", paths, variance * paths);
     }
     return 1 / weights;
 }
@@ -134,9 +135,8 @@ int main(void)
     gsd_field *field;
     gsd_stream *stream;
     memcpy(desc.bounds_max, room, sizeof room);
-    desc.target = GSD_TARGET_SIMPLE; /* the others want an estimate of the picture */
     if (gsd_create(&desc, &field) || gsd_stream_create(field, &stream))
-        return fputs("out of memory\n", stderr), 1;
+        return 1;
     double plain = render(image, field, NULL), guided = render(image + SIZE * SIZE, field, stream);
     printf("variance of the picture: unguided %.4g, guided %.4g: %.1f times less\n", plain, guided, plain / guided);
     FILE *file = fopen("plain.pgm", "wb");

@@ -4,48 +4,28 @@
 #define GSD_IMPLEMENTATION
 #include "guide_sdtree.h"
 #include <stdio.h>
-#include <stdlib.h>
 #if __has_include(<embree4/rtcore.h>)
 #include <embree4/rtcore.h>
 #else
 #include <embree3/rtcore.h>
 #endif
 
-enum { W = 96, H = 72, PIXELS = W * H, MAX_DEPTH = 12, BOXES = 6 };
 static const struct box { // corners, grey of the surface, radiance of a lamp
     float corner[2][3], grey, light;
-} boxes[BOXES] = {{{{0, 0, 0}, {3, 2, 1.5f}}, 0.5f, 0},                   // the walls, seen from inside
-                  {{{2, 0, 0}, {2.05f, 0.7f, 1.5f}}, 0.5f, 0},            // the wall with the door,
-                  {{{2, 0.85f, 0}, {2.05f, 2, 1.5f}}, 0.5f, 0},           // which is ajar
-                  {{{0.9f, 1.2f, 0}, {1.2f, 1.5f, 0.8f}}, 0.7f, 0},       // things in the room
-                  {{{0.3f, 0.8f, 0}, {0.6f, 1.1f, 0.35f}}, 0.7f, 0},      //
-                  {{{2.9f, 0.2f, 0.2f}, {2.95f, 1.2f, 1.2f}}, 0.5f, 10}}; // the lamp behind the door
+} boxes[] = {{{{0, 0, 0}, {3, 2, 1.5f}}, 0.3f, 0},                   // the walls, seen from inside
+             {{{2, 0, 0}, {2.05f, 0.7f, 1.5f}}, 0.3f, 0},            // the wall with the door,
+             {{{2, 0.85f, 0}, {2.05f, 2, 1.5f}}, 0.3f, 0},           // which is ajar
+             {{{0.9f, 1.2f, 0}, {1.2f, 1.5f, 0.8f}}, 0.6f, 0},       // something in the room
+             {{{2.9f, 0.2f, 0.2f}, {2.95f, 1.2f, 1.2f}}, 0.5f, 10}}; // the lamp behind the door
+enum { W = 96, H = 72, PIXELS = W * H, MAX_DEPTH = 12, BOXES = sizeof boxes / sizeof *boxes };
 static RTCScene scene;
-static unsigned long long seed = 1;
 
 static float rnd(void) // in [0, 1)
 {
-    seed = seed * 6364136223846793005u + 1442695040888963407u;
-    return (float)((seed ^ seed >> 22) >> 18 & 0xffffff) / 16777216.0f;
+    static unsigned long long s = 1;
+    return (float)((s = s * 6364136223846793005u + 1442695040888963407u) >> 40) / 16777216.0f;
 }
 static float dot(const float *a, const float *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-
-static void build_scene(RTCDevice device) // one mesh; quad i belongs to box i / 6
-{
-    static const unsigned char quad[24] = {0, 2, 6, 4, 1, 5, 7, 3, 0, 4, 5, 1, 2, 3, 7, 6, 0, 1, 3, 2, 4, 6, 7, 5};
-    RTCGeometry g = rtcNewGeometry(device, RTC_GEOMETRY_TYPE_QUAD);
-    float *v = rtcSetNewGeometryBuffer(g, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, 12, 8 * BOXES);
-    unsigned *index = rtcSetNewGeometryBuffer(g, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT4, 16, 6 * BOXES);
-    for (int i = 0; i < 24 * BOXES; ++i) {
-        v[i] = boxes[i / 24].corner[i / 3 % 8 >> i % 3 & 1][i % 3];
-        index[i] = (unsigned)(i / 24 * 8 + quad[i % 24]);
-    }
-    rtcCommitGeometry(g);
-    scene = rtcNewScene(device);
-    rtcAttachGeometry(scene, g);
-    rtcReleaseGeometry(g);
-    rtcCommitScene(scene);
-}
 
 // The box that the ray hits; moves p there; n is the normal on the ray's side.
 static const struct box *trace(float *p, const float *d, float *n)
@@ -70,9 +50,9 @@ static const struct box *trace(float *p, const float *d, float *n)
 static void sample_cosine(const float *n, float *d) // a point on the unit sphere around the tip of n
 {
     float z = 1 - 2 * rnd(), phi = 6.2831853f * rnd(), r = sqrtf(1 - z * z);
-    float v[3] = {n[0] + r * cosf(phi), n[1] + r * sinf(phi), n[2] + z};
+    float v[3] = {n[0] + r * cosf(phi), n[1] + r * sinf(phi), n[2] + z}, length = sqrtf(dot(v, v)) + 1e-9f;
     for (int k = 0; k < 3; ++k)
-        d[k] = v[k] / (sqrtf(dot(v, v)) + 1e-9f);
+        d[k] = v[k] / length;
 }
 
 // Radiance along one camera path; stream = NULL: unguided.
@@ -83,25 +63,22 @@ static float radiance(float *p, float *d, const gsd_view *field, gsd_stream *str
     int count = 0;
     const struct box *hit = trace(p, d, n);
     while (hit && !(hit->light > 0) && count < MAX_DEPTH) { // lamps do not reflect
-        // 1. Find the cell and how often it wants the BSDF. The jitter blends neighbouring cells.
         float jitter[3] = {rnd(), rnd(), rnd()}, u[2] = {rnd(), rnd()};
-        gsd_handle handle = gsd_find(field, p, jitter);
-        float alpha = stream ? handle.alpha : 1;
-        // 2. One-sample MIS: draw from one of the two, divide by the density of both.
-        if (rnd() < alpha)
+        gsd_handle handle = gsd_find(field, p, jitter); // 1. Find the cell; jittered, which blends neighbours.
+        float alpha = stream ? handle.alpha : 1;        //    How often it wants the BSDF.
+        if (rnd() < alpha)                              // 2. One-sample MIS: draw from one of the two ...
             sample_cosine(n, d);
         else
             gsd_sample(field, &handle, u, d);
         float cosine = dot(n, d), pdf_bsdf = cosine > 0 ? cosine / 3.14159265f : 0;
         float pdf_guide = alpha < 1 ? gsd_pdf(field, &handle, d) : 0;
-        float pdf = alpha * pdf_bsdf + (1 - alpha) * pdf_guide;
+        float pdf = alpha * pdf_bsdf + (1 - alpha) * pdf_guide; // ... and divide by the density of both.
         f_cos[count] = hit->grey / 3.14159265f * cosine;
         vertex[count++] = gsd_make_scalar_sample(p, d, cosine > 0 ? 0 : GSD_REJECTED, 0, 0, pdf, pdf_bsdf, pdf_guide);
         hit = cosine > 0 ? trace(p, d, n) : NULL;
     }
     float L = hit ? hit->light : 0;
-    // 3. Back along the path: L is the radiance from vertex[i].direction.
-    for (int i = count - 1; i >= 0 && L > 0; --i) {
+    for (int i = count - 1; i >= 0 && L > 0; --i) { // 3. Back along the path: L comes from vertex[i].direction.
         vertex[i].radiance = L;
         vertex[i].contribution = vertex[i].pixel_contribution = f_cos[i] * L;
         L *= f_cos[i] / vertex[i].pdf_mix;
@@ -133,27 +110,39 @@ static void render(float *image, int passes, gsd_field *field, gsd_stream *strea
 
 int main(void)
 {
+    static const unsigned char quad[24] = {0, 2, 6, 4, 1, 5, 7, 3, 0, 4, 5, 1, 2, 3, 7, 6, 0, 1, 3, 2, 4, 6, 7, 5};
     static float image[3][PIXELS]; // unguided, guided, reference
     double error[2] = {0, 0};
     gsd_desc desc = {.bounds_max = {3, 2, 1.5f}, .target = GSD_TARGET_SIMPLE}; // the rest: defaults
     gsd_field *field;
     gsd_stream *stream;
     FILE *file = fopen("sdtree.pgm", "wb");
-    if (!file || gsd_create(&desc, &field) || gsd_stream_create(field, &stream))
+    RTCDevice device = rtcNewDevice(NULL);
+    if (!device || !file || gsd_create(&desc, &field) || gsd_stream_create(field, &stream))
         return 1;
-    build_scene(rtcNewDevice(NULL));
+    RTCGeometry g = rtcNewGeometry(device, RTC_GEOMETRY_TYPE_QUAD); // one mesh; quad i belongs to box i / 6
+    float *v = rtcSetNewGeometryBuffer(g, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, 12, 8 * BOXES);
+    unsigned *index = rtcSetNewGeometryBuffer(g, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT4, 16, 6 * BOXES);
+    for (int i = 0; i < 24 * BOXES; ++i) {
+        v[i] = boxes[i / 24].corner[i / 3 % 8 >> i % 3 & 1][i % 3];
+        index[i] = (unsigned)(i / 24 * 8 + quad[i % 24]);
+    }
+    scene = rtcNewScene(device);
+    rtcCommitGeometry(g);
+    rtcAttachGeometry(scene, g);
+    rtcReleaseGeometry(g);
+    rtcCommitScene(scene);
     render(image[0], 7, field, NULL);
     render(image[1], 7, field, stream);
     render(image[2], 9, field, stream); // goes on learning
     fprintf(file, "P5 %d %d 255\n", 2 * W, H);
     for (int i = 0; i < 2 * PIXELS; ++i) {
         int side = i / W % 2, pixel = i / (2 * W) * W + i % W;
-        float v = 255 * sqrtf(2 * image[side][pixel]);
-        error[side] += pow(image[side][pixel] / (image[2][pixel] + 1e-3) - 1, 2) / PIXELS;
-        fputc(v < 255 ? (int)v : 255, file);
+        double grey = 255 * sqrt(9 * image[side][pixel]);
+        error[side] += pow(image[side][pixel] - image[2][pixel], 2) / PIXELS;
+        fputc(grey < 255 ? (int)grey : 255, file);
     }
-    printf("mean squared relative error at 127 samples per pixel: %.3f without, %.3f with guiding\n", error[0],
-           error[1]);
+    printf("squared error at 127 samples per pixel: %.2e without, %.2e with guiding\n", error[0], error[1]);
     fclose(file);
     gsd_stream_destroy(stream);
     gsd_destroy(field);

@@ -11,6 +11,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #define GSD_IMPLEMENTATION
 #include "guide_sdtree.h"
@@ -237,10 +238,18 @@ static void test_documented_defaults_are_the_defaults(void **state)
     const struct {
         const char *name;
         double value;
-    } fields[] = {{"switch_pass", d.switch_pass}, {"split_samples", (double)d.split_samples}, {"rho", (double)d.rho},
-                  {"max_depth", d.max_depth}, {"max_levels", d.max_levels}, {"min_samples", d.min_samples},
-                  {"max_bytes", (double)d.max_bytes}, {"alpha", (double)d.alpha}, {"uniform", (double)d.uniform},
-                  {"gate_margin", (double)d.gate_margin}, {"gate_probe", d.gate_probe}};
+    } fields[] = {{"switch_pass", d.switch_pass},
+                  {"split_samples", (double)d.split_samples},
+                  {"rho", (double)d.rho},
+                  {"max_depth", d.max_depth},
+                  {"max_levels", d.max_levels},
+                  {"min_samples", d.min_samples},
+                  {"max_bytes", (double)d.max_bytes},
+                  {"alpha", (double)d.alpha},
+                  {"uniform", (double)d.uniform},
+                  {"gate_margin", (double)d.gate_margin},
+                  {"gate_gain", (double)d.gate_gain},
+                  {"gate_probe", d.gate_probe}};
     FILE *f = fopen("guide_sdtree.h", "r");
     f = f ? f : fopen("../guide_sdtree.h", "r");
     assert_non_null(f);
@@ -271,6 +280,39 @@ static void test_documented_defaults_are_the_defaults(void **state)
     assert_int_equal(d.spatial_filter, GSD_SPATIAL_NEAREST);
     assert_int_equal(d.directional_filter, GSD_DIRECTIONAL_BOX);
     assert_int_equal(d.alpha_mode, GSD_ALPHA_GRID);
+}
+
+/* The example in the opening comment compiles as it stands, and runs. */
+static void test_the_example_in_the_comment_compiles(void **state)
+{
+    (void)state;
+    FILE *f = fopen("guide_sdtree.h", "r");
+    const char *root = f ? "." : "..";
+    char line[512], command[1024], source[80], program[64];
+    int lines = 0;
+    f = f ? f : fopen("../guide_sdtree.h", "r");
+    assert_non_null(f);
+    snprintf(program, sizeof program, "/tmp/gsd_example_%ld", (long)getpid());
+    snprintf(source, sizeof source, "%s.c", program);
+    FILE *out = fopen(source, "w");
+    assert_non_null(out);
+    while (fgets(line, sizeof line, f)) {
+        if (!lines && strncmp(line, "       #define GSD_IMPLEMENTATION", 33) != 0)
+            continue;
+        if (strncmp(line, "       ", 7) != 0)
+            break;
+        fputs(line + 7, out);
+        lines++;
+    }
+    fclose(f);
+    fclose(out);
+    assert_true(lines >= 15 && lines <= 25);
+    snprintf(command, sizeof command, "%s -std=c99 -Wall -Wextra -Werror -I%s %s -o %s -lm && %s",
+             getenv("CC") ? getenv("CC") : "cc", root, source, program, program);
+    int status = system(command);
+    remove(source);
+    remove(program);
+    assert_int_equal(status, 0);
 }
 
 static void test_bad_descriptors_are_refused_by_name(void **state)
@@ -310,6 +352,7 @@ static void test_sizes_are_as_documented(void **state)
     assert_int_equal(sizeof(gsd_training_sample), 48);
     assert_int_equal(sizeof(gsdi_tree), 32);
     assert_true(sizeof(gsdi_state) < 600);
+    assert_int_equal(sizeof(gsd_stats), 14 * 8 + 16 * 4);
     /* bytes of a field: 16 a node in the sampling part, 12 in the building part */
     gsd_field *few = forest_of(1, 40, 16, false, GSD_SIMD_AUTO), *many = forest_of(1, 1040, 16, false, GSD_SIMD_AUTO);
     gsd_stats a, b;
@@ -465,8 +508,8 @@ static void test_samples_are_uniform_within_a_leaf(void **state)
     }
 }
 
-/* The pdf that sample returns is that of the rounded direction, exactly; it agrees with a double-precision lookup except
-   where rounding moved the direction across a leaf's edge, which is rare. */
+/* The pdf that sample returns is that of the rounded direction, exactly; it agrees with a double-precision lookup
+   except where rounding moved the direction across a leaf's edge, which is rare. */
 static void test_sample_and_pdf_agree(void **state)
 {
     (void)state;
@@ -518,8 +561,9 @@ static void test_estimates_with_the_density_are_unbiased(void **state)
 static void test_seam_poles_and_odd_directions(void **state)
 {
     (void)state;
-    const float d[][3] = {{1, 0, 0}, {1, -0.0f, 0}, {-1, 0, 0}, {-1, -0.0f, 0}, {0, 1, 0}, {0, -1, 0}, {0, 0, 1},
-                          {0, 0, -1}, {-0.0f, -0.0f, 1}, {1, -1e-30f, 0}, {1, 1e-30f, 0}, {0, 0, 1.0001f}};
+    const float d[][3] = {{1, 0, 0},         {1, -0.0f, 0},   {-1, 0, 0},     {-1, -0.0f, 0},
+                          {0, 1, 0},         {0, -1, 0},      {0, 0, 1},      {0, 0, -1},
+                          {-0.0f, -0.0f, 1}, {1, -1e-30f, 0}, {1, 1e-30f, 0}, {0, 0, 1.0001f}};
     const double x[] = {0, 0, 0.5, 0.5, 0.25, 0.75, 0, 0, 0, 1, 0, 0};
     for (unsigned i = 0; i < sizeof d / sizeof *d; ++i) {
         uint32_t cx, cy;
@@ -936,7 +980,8 @@ static void test_cells_split_where_samples_are(void **state)
     gsd_destroy(f);
 }
 
-/* A wall of no thickness, lit from one side: directions towards the lamp are preferred, those through it are not lost. */
+/* A wall of no thickness, lit from one side: directions towards the lamp are preferred, those through it are not lost.
+ */
 static void test_thin_wall_lit_from_one_side(void **state)
 {
     (void)state;
@@ -997,17 +1042,40 @@ static void test_bad_samples_are_refused_and_leave_no_trace(void **state)
                 gsd_training_sample s = clean[(i + 77) % N];
                 float x = bad[(i / 100) % 6];
                 switch ((i / 100) % 11) {
-                case 0: s.radiance = x; break;
-                case 1: s.contribution = x; break;
-                case 2: s.pixel_contribution = x; break;
-                case 3: s.pdf_mix = isfinite(x) && x > 0 ? 0 : x; break;
-                case 4: s.pdf_bsdf = isfinite(x) ? -1 : x; break;
-                case 5: s.pdf_guide = isfinite(x) ? -1 : x; break;
-                case 6: s.direction[i / 100 % 3] = isfinite(x) ? NAN : x; break;
-                case 7: memset(s.direction, 0, sizeof s.direction); break;
-                case 8: s.position[i / 100 % 3] = isfinite(x) ? NAN : x; break;
-                case 9: s.pdf_mix = 0; break;
-                default: s.radiance = 1e15f; s.pdf_mix = 1e-20f; break; /* a quotient beyond the limit */
+                case 0:
+                    s.radiance = x;
+                    break;
+                case 1:
+                    s.contribution = x;
+                    break;
+                case 2:
+                    s.pixel_contribution = x;
+                    break;
+                case 3:
+                    s.pdf_mix = isfinite(x) && x > 0 ? 0 : x;
+                    break;
+                case 4:
+                    s.pdf_bsdf = isfinite(x) ? -1 : x;
+                    break;
+                case 5:
+                    s.pdf_guide = isfinite(x) ? -1 : x;
+                    break;
+                case 6:
+                    s.direction[i / 100 % 3] = isfinite(x) ? NAN : x;
+                    break;
+                case 7:
+                    memset(s.direction, 0, sizeof s.direction);
+                    break;
+                case 8:
+                    s.position[i / 100 % 3] = isfinite(x) ? NAN : x;
+                    break;
+                case 9:
+                    s.pdf_mix = 0;
+                    break;
+                default:
+                    s.radiance = 1e15f;
+                    s.pdf_mix = 1e-20f;
+                    break; /* a quotient beyond the limit */
                 }
                 dirty[m++] = s;
             }
@@ -1330,6 +1398,49 @@ static void test_gate_off_never_closes(void **state)
     for (uint32_t c = 0; c < v.cell_count; ++c)
         assert_true(v.cells[c].alpha == 0.5f);
     gsd_destroy(f);
+}
+
+/* Even light closes a cell from BSDF samples alone, before there is a tree. */
+static void test_gate_closes_even_cells_before_they_have_a_tree(void **state)
+{
+    (void)state;
+    gsd_field *f;
+    seed(5);
+    gsd_stats s = gate_after(false, 1, 1, &f);
+    assert_int_equal(s.closed_cells, s.cells);
+    assert_true(gsd_all_closed(f) && s.closed_share == 1);
+    gsd_destroy(f);
+}
+
+/* The same samples: worth guiding or not by what they contribute to their pixels. */
+static void test_gate_weighs_by_pixels(void **state)
+{
+    (void)state;
+    for (int dark = 0; dark < 2; ++dark) {
+        gsd_desc d = unit_cube(GSD_TARGET_SIMPLE);
+        gsd_field *f;
+        gsd_pass info = {0, true};
+        gsd_stats stats;
+        static gsd_training_sample s[40000];
+        seed(6);
+        OK(gsd_create(&d, &f));
+        for (int pass = 0; pass < 5; ++pass) {
+            gsd_view v = gsd_get_view(f);
+            make_samples(&v, s, 40000);
+            for (int i = 0; i < 40000; ++i) {
+                s[i].radiance = s[i].contribution = s[i].direction[0] > 0.97f ? 100 : 0.01f;
+                s[i].pixel_contribution = s[i].contribution * (dark ? 1 : 1e-4f);
+            }
+            learn(f, s, 40000);
+            OK(gsd_refine(f, &info, NULL, NULL));
+        }
+        gsd_get_stats(f, &stats);
+        if (dark)
+            assert_true(stats.closed_cells == 0 && stats.open_cells > 0);
+        else
+            assert_int_equal(stats.closed_cells, stats.cells);
+        gsd_destroy(f);
+    }
 }
 
 /* A closed cell opens again when the light changes. */
@@ -1669,6 +1780,7 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(test_documented_defaults_are_the_defaults),
+        cmocka_unit_test(test_the_example_in_the_comment_compiles),
         cmocka_unit_test(test_bad_descriptors_are_refused_by_name),
         cmocka_unit_test(test_sizes_are_as_documented),
         cmocka_unit_test(test_pdf_integrates_to_one),
@@ -1696,6 +1808,8 @@ int main(void)
         cmocka_unit_test(test_gate_stays_open_where_light_is_peaked),
         cmocka_unit_test(test_gate_leaves_rarely_lit_cells_open),
         cmocka_unit_test(test_gate_off_never_closes),
+        cmocka_unit_test(test_gate_closes_even_cells_before_they_have_a_tree),
+        cmocka_unit_test(test_gate_weighs_by_pixels),
         cmocka_unit_test(test_closed_cells_are_tried_again),
         cmocka_unit_test(test_alpha_is_learned),
         cmocka_unit_test(test_unread_and_waiting_cells_are_left_alone),

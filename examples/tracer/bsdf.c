@@ -53,6 +53,17 @@ static int nesting(const tr_scene *scene, int id, int depth)
     return a > b ? a : b;
 }
 
+/* Any bump map among bsdf and what nests in it, which is known to end. */
+static bool has_bumps(const tr_scene *scene, const tr_bsdf *bsdf)
+{
+    if (!nests(bsdf->type))
+        return false;
+    if (bsdf->type == TR_BSDF_BUMPMAP && bsdf->bump_texture >= 0)
+        return true;
+    return has_bumps(scene, &scene->bsdfs[bsdf->child[0]]) ||
+           (bsdf->child[1] >= 0 && has_bumps(scene, &scene->bsdfs[bsdf->child[1]]));
+}
+
 static bool check_texture(const tr_scene *scene, const tr_bsdf *bsdf, int texture, tr_log *log)
 {
     if (texture >= -1 && texture < scene->texture_count)
@@ -161,6 +172,11 @@ bool tr_bsdf_finish(tr_scene *scene, tr_bsdf *bsdf, tr_log *log)
             return false;
         }
     }
+    bsdf->bumped = has_bumps(scene, bsdf);
+    const tr_bsdf *leaf = bsdf;
+    while (nests(leaf->type))
+        leaf = &scene->bsdfs[leaf->child[0]];
+    bsdf->first_texture = leaf->reflectance.texture;
     if (bsdf->type == TR_BSDF_PLASTIC)
         bsdf->fdr_internal = tr_fresnel_diffuse(1 / bsdf->ior);
     return bsdf->type != TR_BSDF_ROUGHPLASTIC || make_transmittance(scene, bsdf, log);
@@ -425,11 +441,14 @@ bool tr_closure_prepare(const tr_scene *scene, const tr_surface *surface, vec3 w
             bumped = true;
         }
     }
-    memset(c, 0, sizeof *c);
+    /* Not memset: most of what prepare_leaf leaves alone its type of closure never reads. */
+    c->diffuse = c->specular = c->transmitted = v3s(0);
+    c->specular_probability = c->delta_probability = c->gap_probability = c->roughness = 0;
     c->bsdf = b;
     c->type = (uint8_t)b->type;
     c->distribution = (uint8_t)b->distribution;
     c->nonlinear = b->nonlinear;
+    c->transmits = 0;
     c->bumped = bumped;
     c->frame = frame_from_normal(n);
     c->base_n = base_n;

@@ -69,9 +69,10 @@ static vec3 sample_beckmann(float alpha, vec3 wo, float u1, float u2)
     vec3 w = norm3(v3(alpha * wo.x, alpha * wo.y, wo.z));
     float s = sqrtf(w.x * w.x + w.y * w.y), x, y, cos_phi = 1, sin_phi = 0;
     if (s < 1e-4f) {
-        float r = sqrtf(-logf(1 - u1)), phi = 2 * TR_PI * u2;
-        x = r * cosf(phi);
-        y = r * sinf(phi);
+        float r = sqrtf(-logf(1 - u1)), sine, cosine;
+        sincos_turn(u2, &sine, &cosine);
+        x = r * cosine;
+        y = r * sine;
     } else {
         x = beckmann_slope(w.z, s, u1);
         y = erf_inverse(clampf(2 * u2 - 1, -0.9999999f, 0.9999999f));
@@ -87,8 +88,9 @@ static vec3 sample_ggx(float alpha, vec3 wo, float u1, float u2)
 {
     vec3 w = norm3(v3(alpha * wo.x, alpha * wo.y, wo.z));
     float hz = (1 - u1) * (1 + w.z), z = hz - w.z; /* hz = z + w.z, without cancellation */
-    float r = sqrtf(tr_max(0, 1 - z * z)), phi = 2 * TR_PI * u2;
-    return norm3(v3(alpha * (r * cosf(phi) + w.x), alpha * (r * sinf(phi) + w.y), hz));
+    float r = sqrtf(tr_max(0, 1 - z * z)), sine, cosine;
+    sincos_turn(u2, &sine, &cosine);
+    return norm3(v3(alpha * (r * cosine + w.x), alpha * (r * sine + w.y), hz));
 }
 
 vec3 tr_micro_sample(int distribution, float alpha, vec3 wo, float u1, float u2)

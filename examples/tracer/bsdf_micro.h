@@ -10,10 +10,6 @@
 
 #define TR_ALPHA_MIN 1e-3f
 
-/* fminf and fmaxf are library calls without -ffast-math; these are one instruction. A NaN x gives the bound. */
-static inline float tr_min(float bound, float x) { return x < bound ? x : bound; }
-static inline float tr_max(float bound, float x) { return x > bound ? x : bound; }
-
 /* Unpolarised reflectance between dielectrics (Fresnel; Born & Wolf 1999, 1.5.2), from both cosines, >= 0 and not both
    0; eta = index of the far side over that of the near side. */
 static inline float tr_fresnel_cosines(float cos_i, float cos_t, float eta)

@@ -156,9 +156,10 @@ vec3 tr_closure_eval(const tr_closure *closure, vec3 wi, float *pdf)
 static vec3 sample_phong(const tr_closure *c, float u1, float u2)
 {
     vec3 mirror = v3(-c->wo.x, -c->wo.y, c->wo.z);
-    float z = powf(1 - u1, 1 / (c->exponent + 1)), r = sqrtf(tr_max(0, 1 - z * z)), phi = 2 * TR_PI * u2;
+    float z = powf(1 - u1, 1 / (c->exponent + 1)), r = sqrtf(tr_max(0, 1 - z * z)), sine, cosine;
+    sincos_turn(u2, &sine, &cosine);
     frame3 f = frame_from_normal(mirror);
-    return to_world(&f, v3(r * cosf(phi), r * sinf(phi), z));
+    return to_world(&f, v3(r * cosine, r * sine, z));
 }
 
 /* Reflect or refract wo at microfacet m. Single scattering only: false where that leads through the macrosurface. */
@@ -181,6 +182,13 @@ bool tr_closure_sample(const tr_closure *closure, float u_lobe, float u1, float 
     vec3 local, m;
     if (c->delta_probability >= 1)
         return false;
+    if (c->type == TR_BSDF_DIFFUSE) { /* most vertices: no need to go through eval_local */
+        local = sample_cosine_hemisphere(u1, u2);
+        *wi = to_world(&c->frame, local);
+        *f = blocked(c, *wi, local.z) ? v3s(0) : scale3(c->diffuse, TR_INV_PI);
+        *pdf = local.z * TR_INV_PI;
+        return local.z > 0;
+    }
     switch (c->type) {
     case TR_BSDF_ROUGHCONDUCTOR:
     case TR_BSDF_ROUGHPLASTIC:
@@ -200,7 +208,6 @@ bool tr_closure_sample(const tr_closure *closure, float u_lobe, float u1, float 
     case TR_BSDF_PHONG:
         local = u_lobe < c->specular_probability ? sample_phong(c, u1, u2) : sample_cosine_hemisphere(u1, u2);
         break;
-    case TR_BSDF_DIFFUSE:
     case TR_BSDF_PLASTIC:
         local = sample_cosine_hemisphere(u1, u2);
         break;

@@ -57,7 +57,7 @@ struct tr_worker {
     int smooth[TR_BATCH], smooth_count;
     int place[TR_BATCH]; /* path -> k, -1 = none */
     vec3 p[TR_BATCH], ns[TR_BATCH], wo[TR_BATCH];
-    float roughness[TR_BATCH], find_u[TR_BATCH][3], alpha[TR_BATCH];
+    float roughness[TR_BATCH], find_u[TR_BATCH][3], alpha[TR_BATCH], reflected[TR_BATCH];
     void *handles;
     int index[TR_BATCH];
     vec3 wi[TR_BATCH];
@@ -227,8 +227,8 @@ static void set_ray(struct RTCRay *ray, vec3 o, vec3 d, float far)
 /* Leave the surface on the side of w, by a step that covers rounding of the hit point. */
 static vec3 leave_surface(const tr_scene *scene, const tr_surface *s, vec3 w)
 {
-    float size = fmaxf(fmaxf(fabsf(s->p.x), fabsf(s->p.y)), fabsf(s->p.z));
-    float step = 2e-5f * fmaxf(size, 0.01f * scene->bounds_radius);
+    float size = max3(v3(fabsf(s->p.x), fabsf(s->p.y), fabsf(s->p.z)));
+    float step = 2e-5f * tr_max(size, 0.01f * scene->bounds_radius);
     return madd3(s->p, s->ng, dot3(s->ng, w) < 0 ? -step : step);
 }
 
@@ -288,7 +288,7 @@ static void arrive(tr_worker *w, const tr_frame *frame, int depth, bool recordin
         vec3 emitted = v3s(0);
         bool visible = depth > 0 || !scene->hide_emitters;
         if (met) {
-            tr_surface_from_hit(scene, hit, s);
+            tr_surface_from_hit_lean(scene, hit, s);
             if (scene->shapes[s->shape].light >= 0 && visible)
                 emitted = tr_surface_emission(scene, s, neg3(p->direction));
         } else if (visible && scene->environment_count) {
@@ -470,25 +470,52 @@ static void next_event(tr_worker *w, const tr_frame *frame, bool recording)
 /* ---- >>scatter ---------------------------------------------------------------------------------------------- */
 
 #define ROULETTE_DEPTH 5
+#define ROULETTE_LOW (1.0f / 3) /* lower end of the weight window for a ratio of 5 (Vorba and Krivanek 2016) */
+#define ROULETTE_MIN 0.1f       /* no weight grows by more than ten at once */
 
-/* Roulette on the product of albedos. Paths that lose are dropped. */
+/* Survival by the product of albedos. */
+static float throughput_survival(tr_worker *w, int id, int depth)
+{
+    path *p = &w->paths[id];
+    p->survival *= clampf(max3(tr_closure_albedo(&w->closures[id])), 0, 1);
+    if (depth + 1 < ROULETTE_DEPTH)
+        return 1;
+    float q = clampf(p->survival, 0.05f, 0.95f);
+    p->survival /= q;
+    return q;
+}
+
+/* Survival by expected contribution: throughput times the radiance reflected here, over the pixel's estimate. */
+static float guided_survival(const tr_worker *w, const tr_frame *frame, int id)
+{
+    const path *p = &w->paths[id];
+    int k = w->place[id];
+    if (k < 0 || !p->seen || !(w->reflected[k] > 0))
+        return 1;
+    const float *e = frame->estimate->data + 3 * ((size_t)p->y * (size_t)frame->width + (size_t)p->x);
+    float pixel = (e[0] + e[1] + e[2]) * (1.0f / 3) + 0.25f * frame->estimate_floor;
+    float q = mean3(p->throughput) * w->reflected[k] / (ROULETTE_LOW * pixel);
+    return q < ROULETTE_MIN ? ROULETTE_MIN : q < 1 ? q : 1;
+}
+
+/* Paths that lose are dropped. */
 static void roulette(tr_worker *w, const tr_frame *frame, int depth)
 {
     int kept = 0;
+    tr_roulette mode = frame->settings->roulette;
+    bool guided = mode == TR_ROULETTE_GUIDED && frame->estimate && frame->method->reflected && w->smooth_count > 0;
+    if (guided)
+        frame->method->reflected(frame->method_data, w->smooth_count, w->handles, w->reflected);
     for (int i = 0; i < w->active_count; ++i) {
         int id = w->active[i];
-        path *p = &w->paths[id];
-        w->probability[id] = 1;
-        if (frame->settings->roulette == TR_ROULETTE_THROUGHPUT) {
-            p->survival *= clampf(max3(tr_closure_albedo(&w->closures[id])), 0, 1);
-            if (depth + 1 >= ROULETTE_DEPTH) {
-                float q = clampf(p->survival, 0.05f, 0.95f);
-                w->probability[id] = q;
-                if (rng_float(&p->rng) >= q)
-                    continue;
-                p->survival /= q;
-            }
-        }
+        float q = 1;
+        if (guided)
+            q = guided_survival(w, frame, id);
+        else if (mode == TR_ROULETTE_THROUGHPUT)
+            q = throughput_survival(w, id, depth);
+        w->probability[id] = q;
+        if (q < 1 && rng_float(guided ? &w->paths[id].guide_rng : &w->paths[id].rng) >= q)
+            continue;
         w->active[kept++] = id;
     }
     w->active_count = kept;

@@ -15,16 +15,14 @@
    bright one far away. */
 #define UNIFORM_SHARE 0.2
 
-/* The i with cdf[i] <= u < cdf[i + 1]; intervals without width are never found. */
+/* The i with cdf[i] <= u < cdf[i + 1]; intervals without width are never found. Without branches to mispredict. */
 static uint32_t cdf_find(const float *cdf, uint32_t count, float u)
 {
-    uint32_t lo = 0, hi = count - 1;
-    while (lo < hi) {
-        uint32_t mid = lo + (hi - lo) / 2;
-        if (cdf[mid + 1] > u)
-            hi = mid;
-        else
-            lo = mid + 1;
+    uint32_t lo = 0;
+    while (count > 1) {
+        uint32_t half = count / 2;
+        lo += (cdf[lo + half] <= u) * half;
+        count -= half;
     }
     return lo;
 }
@@ -323,12 +321,6 @@ typedef struct area_point {
     float pdf;
 } area_point;
 
-static vec3 mesh_vertex(const tr_shape *shape, uint32_t index)
-{
-    const float *p = shape->positions + (size_t)index * 3;
-    return v3(p[0], p[1], p[2]);
-}
-
 static void mesh_point(const tr_shape *shape, float u_extra, float u1, float u2, area_point *out)
 {
     uint32_t i = cdf_find(shape->area_cdf, shape->triangle_count, u1);
@@ -336,12 +328,10 @@ static void mesh_point(const tr_shape *shape, float u_extra, float u1, float u2,
     float width = shape->area_cdf[i + 1] - shape->area_cdf[i];
     float a = width > 0 ? (u1 - shape->area_cdf[i] + u_extra * 0x1p-24f) / width : 0;
     a = clampf(a, 0, 1);
-    const uint32_t *t = shape->indices + (size_t)i * 3;
-    vec3 p0 = mesh_vertex(shape, t[0]), p1 = mesh_vertex(shape, t[1]), p2 = mesh_vertex(shape, t[2]);
-    vec3 e1 = sub3(p1, p0), e2 = sub3(p2, p0), n = norm3(cross3(e1, e2));
+    const tr_emitter *e = &shape->emitters[i];
     float s = sqrtf(a), b1 = s * (1 - u2), b2 = s * u2;
-    out->p = madd3(madd3(p0, e1, b1), e2, b2);
-    out->ng = shape->flip_normals ? neg3(n) : n;
+    out->p = madd3(madd3(e->p, e->e1, b1), e->e2, b2);
+    out->ng = e->n;
     out->pdf = 1.0f / shape->area;
 }
 
@@ -425,19 +415,15 @@ static bool area_sample(const tr_scene *scene, const tr_light *light, vec3 p, fl
     sample->radiance = light->value;
     if (shape->type == TR_SHAPE_SPHERE && !shape->flip_normals)
         return sphere_sample(shape, p, u1, u2, sample);
-    area_point point;
-    memset(&point, 0, sizeof point);
+    area_point point = {0};
     shape_point(shape, u_extra, u1, u2, &point);
     vec3 d = sub3(point.p, p);
-    float d2 = dot3(d, d);
-    if (!(d2 > 0))
+    float d2 = dot3(d, d), facing = -dot3(point.ng, d);
+    if (!(facing > 0 && d2 > 0)) /* the most common answer, hence first */
         return false;
     sample->distance = sqrtf(d2);
     sample->wi = scale3(d, 1 / sample->distance);
-    float cosine = -dot3(point.ng, sample->wi);
-    if (!(cosine > 0))
-        return false;
-    sample->pdf = point.pdf * d2 / cosine;
+    sample->pdf = point.pdf * d2 * sample->distance / facing;
     return true;
 }
 

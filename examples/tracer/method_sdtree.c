@@ -169,15 +169,12 @@ static bool sdtree_begin_pass(void *method, const tr_pass *pass)
     return !pass->last;
 }
 
-/* Whether a tile's paths are worth recording: a fixed pseudo-random subset that changes from pass to pass. */
+/* Whether a tile's paths are worth recording: every 1 / fraction-th, starting elsewhere in every pass. */
 static bool sdtree_wants_records(void *method, int tile)
 {
     const sdtree *m = method;
-    uint32_t h = ((uint32_t)tile * 0x9e3779b1u) ^ ((uint32_t)m->pass * 0x85ebca6bu);
-    h = (h ^ h >> 15) * 0x2c1b3c6du;
-    h = (h ^ h >> 12) * 0x297a2d39u;
-    h ^= h >> 15;
-    return (float)(h >> 8) < m->fraction * 16777216.0f;
+    double start = m->pass * 0.6180339887 + tile * (double)m->fraction;
+    return floor(start + (double)m->fraction) > floor(start);
 }
 
 static gsd_training_sample convert(const tr_vertex *v)
@@ -230,6 +227,7 @@ static bool sdtree_end_pass(void *method, const tr_pass *pass)
         return true;
     sdtree_flush(m);
     info.spp = (uint32_t)pass->spp;
+    info.pixel_estimate = pass->index > 0; /* of the passes before */
     gsd_result result = gsd_refine(m->field, &info, m->parallel, m->parallel_user);
     m->view = gsd_get_view(m->field);
     return !result;

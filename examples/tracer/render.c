@@ -34,7 +34,7 @@ static const char usage_text[] = "usage: render SCENE.xml|SCENE.gltf|SCENE.glb [
                                  "  --size WxH            picture size (default: the scene's)\n"
                                  "  --max-depth D         path edges, 1 = emitted light only (default: the scene's)\n"
                                  "  --nee on|off          next event estimation (default on)\n"
-                                 "  --rr on|off           Russian roulette on the albedo from the 5th edge on (default off)\n"
+                                 "  --rr guided|off|on    Russian roulette: by what the guide expects (default; pt: off), none, by throughput\n"
                                  "  --seed N, --threads N\n"
                                  "  -D name=value         value for $name in the scene file (repeatable)\n"
                                  "  --reference R.exr     print errors against R; R may be larger by a whole factor\n"
@@ -89,6 +89,13 @@ static bool parse_switch(const char *text, bool *on)
     return *on || !strcmp(text, "off");
 }
 
+static bool parse_roulette(const char *text, tr_roulette *mode)
+{
+    bool guided = !strcmp(text, "guided"), on = !strcmp(text, "on");
+    *mode = guided ? TR_ROULETTE_GUIDED : on ? TR_ROULETTE_THROUGHPUT : TR_ROULETTE_OFF;
+    return guided || on || !strcmp(text, "off");
+}
+
 /* Split key=value in place. */
 static bool parse_pair(char *text, const char **key, const char **value)
 {
@@ -129,7 +136,7 @@ static bool apply(options *o, const char *name, char *value, bool *known)
     else if (!strcmp(name, "--nee"))
         ok = parse_switch(value, &on), s->no_nee = !on;
     else if (!strcmp(name, "--rr"))
-        ok = parse_switch(value, &on), s->roulette = on ? TR_ROULETTE_THROUGHPUT : TR_ROULETTE_OFF;
+        ok = parse_roulette(value, &s->roulette);
     else if (!strcmp(name, "--seed"))
         ok = parse_long(value, 0, LONG_MAX, &n), s->seed = (uint64_t)n;
     else if (!strcmp(name, "--threads"))

@@ -260,6 +260,26 @@ static vec3 triangle_cross(const tr_shape *s, uint32_t t)
     return cross3(sub3(vertex(s, t, 1), p0), sub3(vertex(s, t, 2), p0));
 }
 
+/* Room for area_cdf, still to be filled, and the emitters behind it. */
+static bool make_emitters(tr_shape *s)
+{
+    size_t n = s->triangle_count;
+    s->area_cdf = malloc((n + 1) * sizeof *s->area_cdf + n * sizeof *s->emitters);
+    if (!s->area_cdf)
+        return false;
+    tr_emitter *e = (tr_emitter *)(s->area_cdf + n + 1);
+    s->emitters = e;
+    for (uint32_t t = 0; t < s->triangle_count; ++t) {
+        e[t].p = vertex(s, t, 0);
+        e[t].e1 = sub3(vertex(s, t, 1), e[t].p);
+        e[t].e2 = sub3(vertex(s, t, 2), e[t].p);
+        e[t].n = norm3(triangle_cross(s, t));
+        if (s->flip_normals)
+            e[t].n = neg3(e[t].n);
+    }
+    return true;
+}
+
 bool tr_shape_measure(tr_shape *s, bool with_cdf)
 {
     vec3 x = mat4_column(&s->object_to_world, 0), y = mat4_column(&s->object_to_world, 1);
@@ -273,11 +293,9 @@ bool tr_shape_measure(tr_shape *s, bool with_cdf)
     else {
         free(s->area_cdf);
         s->area_cdf = NULL;
-        if (with_cdf) {
-            s->area_cdf = malloc(((size_t)s->triangle_count + 1) * sizeof(float));
-            if (!s->area_cdf)
-                return false;
-        }
+        s->emitters = NULL;
+        if (with_cdf && !make_emitters(s))
+            return false;
         for (uint32_t t = 0; t < s->triangle_count; ++t)
             sum += 0.5 * (double)len3(triangle_cross(s, t));
         double run = 0;
@@ -473,25 +491,22 @@ bool tr_shape_attach(tr_shape *s, RTCDevice device, RTCScene rtc, unsigned id)
 
 /* ---- >>surface ---------------------------------------------------------------------------------------------- */
 
-/* dpdu and dpdv from uv differences (a linear solve), else any frame around n. */
-static void mesh_tangents(const tr_shape *s, uint32_t t, vec3 e1, vec3 e2, float b1, float b2, tr_surface *out)
+/* dpdu and dpdv from uv differences (a linear solve), else any frame around ng. */
+static void mesh_tangents(const tr_shape *s, tr_surface *out)
 {
     if (s->uvs) {
-        const uint32_t *id = s->indices + 3 * (size_t)t;
+        const uint32_t *id = s->indices + 3 * (size_t)out->prim;
         const float *a = s->uvs + 2 * (size_t)id[0], *b = s->uvs + 2 * (size_t)id[1], *c = s->uvs + 2 * (size_t)id[2];
         float du1 = b[0] - a[0], dv1 = b[1] - a[1], du2 = c[0] - a[0], dv2 = c[1] - a[1];
         float det = du1 * dv2 - dv1 * du2;
-        out->u = a[0] + b1 * du1 + b2 * du2;
-        out->v = a[1] + b1 * dv1 + b2 * dv2;
+        vec3 p0 = vertex(s, out->prim, 0), e1 = sub3(vertex(s, out->prim, 1), p0),
+             e2 = sub3(vertex(s, out->prim, 2), p0);
         if (fabsf(det) > 1e-20f) {
             out->dpdu = scale3(sub3(scale3(e1, dv2), scale3(e2, dv1)), 1 / det);
             out->dpdv = scale3(sub3(scale3(e2, du1), scale3(e1, du2)), 1 / det);
             if (dot3(out->dpdu, out->dpdu) > 0 && finite3(out->dpdu) && finite3(out->dpdv))
                 return;
         }
-    } else {
-        out->u = b1;
-        out->v = b2;
     }
     frame3 f = frame_from_normal(out->ng);
     out->dpdu = f.s;
@@ -504,7 +519,13 @@ static void mesh_surface(const tr_shape *s, uint32_t t, float b1, float b2, tr_s
     vec3 p0 = vertex(s, t, 0), e1 = sub3(vertex(s, t, 1), p0), e2 = sub3(vertex(s, t, 2), p0);
     out->p = madd3(madd3(p0, e1, b1), e2, b2);
     out->ng = out->ns = norm3(cross3(e1, e2));
-    mesh_tangents(s, t, e1, e2, b1, b2, out);
+    out->u = b1;
+    out->v = b2;
+    if (s->uvs) {
+        const float *a = s->uvs + 2 * (size_t)id[0], *b = s->uvs + 2 * (size_t)id[1], *c = s->uvs + 2 * (size_t)id[2];
+        out->u = a[0] + b1 * (b[0] - a[0]) + b2 * (c[0] - a[0]);
+        out->v = a[1] + b1 * (b[1] - a[1]) + b2 * (c[1] - a[1]);
+    }
     if (!s->normals)
         return;
     const float *n = s->normals;
@@ -599,18 +620,31 @@ void tr_surface_prefetch(const tr_scene *scene, const struct RTCRayHit *hit, int
     }
 }
 
-void tr_surface_from_hit(const tr_scene *scene, const struct RTCRayHit *hit, tr_surface *surface)
+static inline void surface_from_hit(const tr_shape *s, const struct RTCRayHit *hit, bool tangents, tr_surface *surface)
 {
-    const tr_shape *s = &scene->shapes[hit->hit.geomID];
     surface->shape = (int)hit->hit.geomID;
     surface->prim = hit->hit.primID;
     surface->t = hit->ray.tfar;
-    if (s->type == TR_SHAPE_MESH)
+    if (s->type == TR_SHAPE_MESH) {
         mesh_surface(s, hit->hit.primID, hit->hit.u, hit->hit.v, surface);
-    else
+        if (tangents)
+            mesh_tangents(s, surface);
+    } else {
         analytic_surface(s, &hit->ray, surface);
+    }
     if (s->flip_normals) {
         surface->ng = neg3(surface->ng);
         surface->ns = neg3(surface->ns);
     }
+}
+
+void tr_surface_from_hit(const tr_scene *scene, const struct RTCRayHit *hit, tr_surface *surface)
+{
+    surface_from_hit(&scene->shapes[hit->hit.geomID], hit, true, surface);
+}
+
+void tr_surface_from_hit_lean(const tr_scene *scene, const struct RTCRayHit *hit, tr_surface *surface)
+{
+    const tr_shape *s = &scene->shapes[hit->hit.geomID];
+    surface_from_hit(s, hit, s->bsdf >= 0 && scene->bsdfs[s->bsdf].bumped, surface);
 }

@@ -33,8 +33,11 @@ static inline vec3 cross3(vec3 a, vec3 b)
 }
 static inline float len3(vec3 a) { return sqrtf(dot3(a, a)); }
 static inline float mean3(vec3 a) { return (a.x + a.y + a.z) * (1.0f / 3.0f); }
-static inline float max3(vec3 a) { return fmaxf(a.x, fmaxf(a.y, a.z)); }
-static inline bool finite3(vec3 a) { return isfinite(a.x) && isfinite(a.y) && isfinite(a.z); }
+/* fminf and fmaxf are library calls without -ffast-math; these are one instruction. A NaN x gives the bound. */
+static inline float tr_min(float bound, float x) { return x < bound ? x : bound; }
+static inline float tr_max(float bound, float x) { return x > bound ? x : bound; }
+static inline float max3(vec3 a) { return tr_max(tr_max(a.z, a.y), a.x); }
+static inline bool finite3(vec3 a) { return (a.x - a.x) + (a.y - a.y) + (a.z - a.z) == 0; } /* inf - inf is NaN */
 static inline bool black3(vec3 a) { return a.x == 0 && a.y == 0 && a.z == 0; }
 /* The unit vector along a; (0, 0, 1) where a has no direction. */
 static inline vec3 norm3(vec3 a)
@@ -125,16 +128,32 @@ static inline tr_rng rng_seed(uint64_t seed, uint64_t stream)
     return r;
 }
 
+/* Sine and cosine of u full turns, 0 <= u <= 1, to 1e-7, inline: the warps below take most of their time here. The
+   nearest quarter turn is taken off exactly; Taylor's polynomials, their last terms adjusted, do the rest. */
+static inline void sincos_turn(float u, float *sine, float *cosine)
+{
+    int quarter = (int)(u * 4 + 0.5f);
+    float x = (u - 0.25f * (float)quarter) * (2 * TR_PI), x2 = x * x;
+    float s = x + x * x2 * (-1.6666654611e-1f + x2 * (8.3321608736e-3f - x2 * 1.9515295891e-4f));
+    float c =
+        1 - 0.5f * x2 + x2 * x2 * (4.166664568298827e-2f + x2 * (-1.388731625493765e-3f + x2 * 2.443315711809948e-5f));
+    float a = quarter & 1 ? c : s, b = quarter & 1 ? s : c;
+    *sine = quarter & 2 ? -a : a;
+    *cosine = (quarter + 1) & 2 ? -b : b;
+}
+
 /* Warps of (u1, u2) in [0,1)^2. */
 static inline vec3 sample_cosine_hemisphere(float u1, float u2)
 {
-    float r = sqrtf(u1), phi = 2 * TR_PI * u2;
-    return v3(r * cosf(phi), r * sinf(phi), sqrtf(fmaxf(0, 1 - u1)));
+    float r = sqrtf(u1), s, c;
+    sincos_turn(u2, &s, &c);
+    return v3(r * c, r * s, sqrtf(tr_max(0, 1 - u1)));
 }
 static inline vec3 sample_uniform_sphere(float u1, float u2)
 {
-    float z = 1 - 2 * u1, r = sqrtf(fmaxf(0, 1 - z * z)), phi = 2 * TR_PI * u2;
-    return v3(r * cosf(phi), r * sinf(phi), z);
+    float z = 1 - 2 * u1, r = sqrtf(tr_max(0, 1 - z * z)), s, c;
+    sincos_turn(u2, &s, &c);
+    return v3(r * c, r * s, z);
 }
 /* The share of strategy a in the balance heuristic (Veach 1997). */
 static inline float balance(float a, float b) { return a > 0 ? (isinf(a) ? 1 : a / (a + b)) : 0; }

@@ -133,7 +133,9 @@ typedef struct tr_bsdf {
     int bump_texture;
     float bump_scale;
     /* Filled by tr_bsdf_finish. */
-    float fdr_internal;    /* plastic: diffuse Fresnel reflectance from inside */
+    bool bumped;          /* this or a nested bsdf is a bump map with a texture */
+    int first_texture;    /* what this or the first nested bsdf reads for its colour, to prefetch; -1 = none */
+    float fdr_internal;   /* plastic: diffuse Fresnel reflectance from inside */
     float *transmittance; /* rough plastic: hemispherical transmittance over cos theta, TR_TRANSMITTANCE_SIZE entries */
     float transmittance_internal;
 } tr_bsdf;
@@ -147,6 +149,11 @@ void tr_bsdf_defaults(tr_bsdf *bsdf,
 /* Rectangle and cube are meshes; the others are analytic in object space: unit sphere at the origin, unit disk in
    z = 0 with normal +z, unit cylinder around z from z = 0 to 1. */
 typedef enum tr_shape_type { TR_SHAPE_MESH, TR_SHAPE_SPHERE, TR_SHAPE_DISK, TR_SHAPE_CYLINDER } tr_shape_type;
+
+/* A triangle of a light: one place in memory to read instead of an index and three vertices. */
+typedef struct tr_emitter {
+    vec3 p, e1, e2, n; /* corner, edges from it, unit front normal (flip_normals applied) */
+} tr_emitter;
 
 typedef struct tr_shape {
     tr_shape_type type;
@@ -166,7 +173,8 @@ typedef struct tr_shape {
     vec3 center;
     float radius;
     float area;
-    float *area_cdf; /* light meshes: [triangle_count + 1], 0 .. 1 */
+    float *area_cdf; /* light meshes: [triangle_count + 1], 0 .. 1, and behind it what `emitters` points to */
+    const struct tr_emitter *emitters; /* light meshes: [triangle_count] */
 } tr_shape;
 
 /* ---- >>light ------------------------------------------------------------------------------------------------ */
@@ -277,15 +285,17 @@ bool tr_lights_finish(tr_scene *scene, tr_log *log);              /* called by t
 /* A point on a surface. ng and ns are unit, as the shape defines its front (not turned towards the ray). */
 typedef struct tr_surface {
     vec3 p, ng, ns;
-    vec3 dpdu, dpdv;
     float u, v;
     float t; /* distance along the ray */
     int shape;
     uint32_t prim;
+    vec3 dpdu, dpdv;
 } tr_surface;
 
 /* Fill a surface from Embree's answer (ray.geomID valid). */
 void tr_surface_from_hit(const tr_scene *scene, const struct RTCRayHit *hit, tr_surface *surface);
+/* The same, but dpdu and dpdv are only valid where the shape's bsdf reads them (tr_bsdf.bumped). */
+void tr_surface_from_hit_lean(const tr_scene *scene, const struct RTCRayHit *hit, tr_surface *surface);
 /* Ask the cache for what tr_surface_from_hit will read: stage 0 some hits ahead, stage 1 (needs stage 0's) nearer. */
 void tr_surface_prefetch(const tr_scene *scene, const struct RTCRayHit *hit, int stage);
 
@@ -300,18 +310,19 @@ typedef struct tr_closure {
     uint8_t nonlinear;
     uint8_t transmits; /* smooth part reaches the far side of the surface */
     uint8_t bumped;    /* directions on different sides of base_n and frame.n count as blocked */
-    frame3 frame;      /* shading frame; frame.n is bumped, and turned to wo for twosided and dielectrics */
-    vec3 base_n;       /* frame.n without the bump map */
-    vec3 wo;           /* local */
+    float roughness;   /* 0 mirror .. 1 diffuse, for guiding records */
+    float delta_probability;
+    frame3 frame; /* shading frame; frame.n is bumped, and turned to wo for twosided and dielectrics */
     vec3 diffuse, specular, transmitted;
+    float specular_probability; /* share of the smooth part's samples given to its glossy lobe */
+    float gap_probability;      /* mask: share of the delta part that goes straight through */
+    float opacity;
+    vec3 base_n; /* frame.n without the bump map */
+    vec3 wo;     /* local */
+    /* Only where the type has them: */
+    const tr_bsdf *bsdf;
     vec3 eta, k;
     float ior, alpha, exponent;
-    float opacity;
-    float specular_probability; /* share of the smooth part's samples given to its glossy lobe */
-    float delta_probability;
-    float gap_probability; /* mask: share of the delta part that goes straight through */
-    float roughness; /* 0 mirror .. 1 diffuse, for guiding records */
-    const tr_bsdf *bsdf;
     /* Scratch that prepare computes once (Fresnel terms and the like). */
     float fresnel, scratch[3];
 } tr_closure;
@@ -434,6 +445,8 @@ typedef struct tr_method {
                    float *pdf);
     /* Density of wi[index[i]] under handles[index[i]], to pdf[index[i]]. */
     void (*pdf)(void *method, int n, const int *index, const void *handles, const vec3 *wi, float *pdf);
+    /* Mean radiance that the surface at each handle's vertex reflects, to radiance[i]; 0 = not known yet. */
+    void (*reflected)(void *method, int n, const void *handles, float *radiance);
     bool (*record)(void *method, int tile, const tr_vertex *vertices, int n); /* false = out of memory */
     bool (*wants_records)(void *method, int tile);       /* false = this tile's records are not needed in this pass */
     void (*flush)(void *method);                         /* take in what the tiles recorded */
@@ -451,7 +464,9 @@ const tr_method *const *tr_method_list(void);      /* NULL-terminated */
 
 /* ---- >>render ----------------------------------------------------------------------------------------------- */
 
-typedef enum tr_roulette { TR_ROULETTE_OFF, TR_ROULETTE_THROUGHPUT } tr_roulette;
+/* Guided roulette compares what a vertex is expected to add with what its pixel needs (Vorba and Krivanek 2016); it asks
+   the method, and is off where the method cannot tell. Throughput: the product of albedos, from the 5th edge on. */
+typedef enum tr_roulette { TR_ROULETTE_GUIDED, TR_ROULETTE_OFF, TR_ROULETTE_THROUGHPUT } tr_roulette;
 
 typedef struct tr_settings {
     int width, height; /* 0 = the scene's */
