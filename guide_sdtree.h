@@ -81,7 +81,7 @@
    OPTIONS: see gsd_desc. gsd_resolve fills in defaults, gsd_get_desc returns what a field uses.
 
    MEMORY
-     Sampling part: 16 bytes per quadtree node, 32 per cell, 28 per quadtree, 256 per quadtree of more than 64 nodes
+     Sampling part: 16 bytes per quadtree node, 36 per cell, 28 per quadtree, 256 per quadtree of more than 64 nodes
      (a table that skips three levels), 12 per leaf with desc.alias, 4 per spatial node, and 16 KB.
      Building part: 12 bytes per quadtree node, sizeof(gsd_cell_state) (below 600) per cell.
      max_bytes bounds the peak of both parts while refine runs, old and new together: trees coarsen and cells stop
@@ -115,6 +115,7 @@
    REFERENCES
      T. Mueller, M. Gross, J. Novak 2017, Practical Path Guiding for Efficient Light-Transport Simulation.
      T. Mueller 2019, "Practical Path Guiding" in Production, ch. 10 of SIGGRAPH course Path Guiding in Production.
+     J. Vorba, J. Krivanek 2016, Adjoint-Driven Russian Roulette and Splitting in Light Transport Simulation.
      A. Rath, P. Grittmann, S. Herholz, P. Vevoda, P. Slusallek, J. Krivanek 2020, Variance-Aware Path Guiding.
      A. Walker 1977, An Efficient Method for Generating Discrete Random Variables with General Distributions (alias).
      D. Kingma, J. Ba 2015, Adam. */
@@ -310,16 +311,17 @@ typedef struct gsd_alias {
     uint32_t node, other;
 } gsd_alias;
 
-/* 32 bytes: what a query knows about a cell. */
+/* 36 bytes: what a query knows about a cell. */
 typedef struct gsd_cell {
     uint32_t root;        /* node of its quadtree; 0 = uniform */
     uint32_t jump;        /* into the table of jumps; 0 = none */
     uint32_t alias;       /* into the alias slots */
     uint32_t alias_count; /* 0 = none */
     float alpha;
-    uint32_t tree;  /* index of its quadtree */
-    uint32_t level; /* in the spatial tree */
-    uint32_t gate;  /* GSD_GATE_... */
+    uint32_t tree;   /* index of its quadtree */
+    uint32_t level;  /* in the spatial tree */
+    uint32_t gate;   /* GSD_GATE_... */
+    float reflected; /* see gsd_handle */
 } gsd_cell;
 enum { GSD_GATE_UNJUDGED, GSD_GATE_OPEN, GSD_GATE_CLOSED };
 
@@ -338,10 +340,12 @@ typedef struct gsd_view {
 } gsd_view;
 #define GSD_CELL_BIT 0x80000000u
 
-/* What find gives: plain data, 24 bytes, valid as long as the view. */
+/* What find gives: plain data, 28 bytes, valid as long as the view. */
 typedef struct gsd_handle {
     uint32_t cell, root, jump, alias, alias_count;
-    float alpha; /* probability of BSDF sampling; 1 = do not guide */
+    float alpha;     /* probability of BSDF sampling; 1 = do not guide */
+    float reflected; /* mean of contribution / pdf_mix in the cell: the radiance that its surfaces reflect, W/m^2/sr; 0
+                        = not known. What a path can still bring here, for Russian roulette [Vorba 2016] */
 } gsd_handle;
 
 /* ---- >>field ------------------------------------------------------------------------------------------------ */
@@ -516,7 +520,7 @@ GSD_QUERY uint32_t gsd_leaf_at(const gsd_view *view, const gsd_handle *handle, u
 /* The cell as a handle. cell < view->cell_count; larger ones give the uniform density. For forests. [any thread] */
 GSD_QUERY gsd_handle gsd_find_cell(const gsd_view *view, uint32_t cell)
 {
-    gsd_handle handle = {0, 0, 0, 0, 0, 1.0f};
+    gsd_handle handle = {0, 0, 0, 0, 0, 1.0f, 0};
     if (cell < view->cell_count) {
         const gsd_cell *c = &view->cells[cell];
         handle.cell = cell;
@@ -525,6 +529,7 @@ GSD_QUERY gsd_handle gsd_find_cell(const gsd_view *view, uint32_t cell)
         handle.alias = c->alias;
         handle.alias_count = c->alias_count;
         handle.alpha = c->alpha;
+        handle.reflected = c->reflected;
     }
     return handle;
 }
@@ -741,13 +746,14 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_MAX_ROOT 1e15    /* values are clamped to this before squaring */
 #define GSDI_CONFIDENCE 1.645 /* one-sided 95 % of the normal distribution */
 #define GSDI_MIN_EFFECTIVE                                                                                             \
-    128.0                     /* effective non-zero samples for the verdict "this tree does not pay"; fewer closes     \
-                                 cells whose light is rarely found */
-#define GSDI_MIN_EVEN 32.0    /* for "too even to pay" */
-#define GSDI_MIN_OPEN 4.0     /* for "pays" */
-#define GSDI_ENOUGH_HITS 256u /* non-zero samples of a cell and pass; from then on the gate takes one of eight */
-#define GSDI_MIN_REBUILDS 3   /* before that verdict: the first trees are noise */
-#define GSDI_HISTORY 0.5      /* share of the sums kept where passes do not grow */
+    128.0                         /* effective non-zero samples for the verdict "this tree does not pay"; fewer closes \
+                                     cells whose light is rarely found */
+#define GSDI_MIN_EVEN 32.0        /* for "too even to pay" */
+#define GSDI_MIN_OPEN 4.0         /* for "pays" */
+#define GSDI_ENOUGH_HITS 256u     /* non-zero samples of a cell and pass; from then on the gate takes one of eight */
+#define GSDI_REFLECTED_SAMPLES 32 /* of a cell and pass, for its mean reflected radiance to count */
+#define GSDI_MIN_REBUILDS 3       /* before that verdict: the first trees are noise */
+#define GSDI_HISTORY 0.5          /* share of the sums kept where passes do not grow */
 #define GSDI_MAX_CELLS (1u << 26)
 
 /* ---- >>memory ----------------------------------------------------------------------------------------------- */
@@ -803,6 +809,7 @@ typedef struct gsdi_state {
     double cross[GSDI_GATE_LOW];   /* sum of x_a x_1 */
     double weight;                 /* sum of contribution / p */
     double pixel, pixel_v;         /* sum of x_1 (pixel contribution / contribution)^2, and of x_1 beside it */
+    double flow;                   /* sum of contribution / p of this pass */
     float theta, moment1, moment2; /* Adam: alpha = sigmoid(theta) */
     uint32_t steps;
     float alpha;    /* learned; what queries see is in gsd_cell */
@@ -814,7 +821,7 @@ typedef struct gsdi_state {
     uint32_t level;
     uint32_t rebuilds; /* times its sampling tree was rebuilt */
     uint32_t hits;     /* non-zero samples that the gate took in this pass */
-    uint32_t reserved;
+    float reflected;   /* flow / fresh of the last pass that had enough samples, 0 = none had */
     uint32_t bins[64]; /* held by 4 x 4 x 4 sub-cells, index x y z with 2 bits each, for several splits at once */
 } gsdi_state;
 
@@ -1372,6 +1379,7 @@ static void gsdi_learn(const gsdi_accumulation *a, gsdi_state *state, const gsd_
     bool judge = a->judge && (state->gate != GSD_GATE_CLOSED || state->probe == 0);
     bool weigh = a->second_moment && !desc->no_guide_weight && value > 0;
     state->fresh += 1;
+    state->flow += c / p < 1e30 ? c / p : 1e30;
     state->bins[item->x >> 24] += 1;
     judge = judge && (state->hits < GSDI_ENOUGH_HITS || ((uint32_t)(int64_t)state->fresh & 7u) == 0);
     state->gate_count += judge;
@@ -2213,6 +2221,7 @@ static void gsdi_cell_write(gsdi_block *b, const gsdi_tree *trees, gsd_cell *cel
     cell->tree = tree;
     cell->level = s->level;
     cell->gate = s->gate;
+    cell->reflected = s->reflected;
     cell->alpha = t->groups == 0 || s->gate == GSD_GATE_CLOSED ? 1.0f : s->alpha;
 }
 
@@ -2260,7 +2269,7 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
             for (k = 0; k < p->count; ++k)
                 r->sum[p->first + k] = 0;
         }
-        s->fresh = 0;
+        s->fresh = s->flow = 0;
         s->hits = 0;
         gsdi_cell_write(r->block, r->trees, &gsdi_cells(r->block)[i], s, job->tree);
     }
@@ -2367,6 +2376,8 @@ static void gsdi_judge_cells(gsdi_refinement *r, const gsd_pass *pass, double sa
     uint32_t i;
     for (i = 0; i < r->field->block->cells; ++i) {
         gsdi_state *s = &r->field->states[i];
+        if (s->fresh >= GSDI_REFLECTED_SAMPLES)
+            s->reflected = (float)(s->flow / s->fresh);
         if (s->fresh > 0)
             gsdi_judge(r->desc, pixels, changed, s, &r->stats);
         closed += s->gate == GSD_GATE_CLOSED ? s->fresh : 0;
@@ -2778,6 +2789,7 @@ GSD_API gsd_result gsd_forest_split(gsd_field *field, uint32_t parent, uint32_t 
         field->sum[s->first + i] *= 0.5;
     s->held *= 0.5;
     s->fresh *= 0.5;
+    s->flow *= 0.5;
     gsdi_gate_scale(s, 0.5);
     children[0] = child_a;
     children[1] = child_b;
@@ -3637,8 +3649,8 @@ static bool gsdi_state_ok(const gsd_field *field, const gsdi_state *s, const gsd
     uint32_t k;
     if (c->tree >= field->block->trees || s->gate > GSD_GATE_CLOSED || !(s->alpha >= 0.049f && s->alpha <= 1) ||
         !(s->theta > -10 && s->theta < 10) || !gsdi_finite(s->moment1) || !gsdi_finite(s->moment2) ||
-        !(s->held >= 0 && s->held < 1e18) || !(s->fresh >= 0 && s->fresh < 1e18) || !(s->gate_count >= 0) ||
-        !(s->weight >= 0 && s->weight < 1e300) || !(s->pixel >= 0 && s->pixel < 1e300) ||
+        !(s->held >= 0 && s->held < 1e18) || !(s->fresh >= 0 && s->fresh < 1e18) || !(s->flow >= 0 && s->flow < 1e50) ||
+        !(s->gate_count >= 0) || !(s->weight >= 0 && s->weight < 1e300) || !(s->pixel >= 0 && s->pixel < 1e300) ||
         !(s->pixel_v >= 0 && s->pixel_v < 1e300) || s->level > 60)
         return false;
     for (k = 0; k <= GSDI_GATE_LOW; ++k)
@@ -3652,8 +3664,9 @@ static bool gsdi_state_ok(const gsd_field *field, const gsdi_state *s, const gsd
     should.tree = c->tree;
     should.alpha = c->alpha;
     should.gate = c->gate;
-    return memcmp(&should, c, sizeof should) == 0 && c->alpha >= 0.049f && c->alpha <= 1 &&
-           c->gate <= GSD_GATE_CLOSED && gsdi_building_ok(field, s);
+    should.reflected = c->reflected;
+    return memcmp(&should, c, sizeof should) == 0 && c->reflected >= 0 && c->reflected <= 1e30f && c->alpha >= 0.049f &&
+           c->alpha <= 1 && c->gate <= GSD_GATE_CLOSED && gsdi_building_ok(field, s);
 }
 
 GSD_API gsd_result gsd_validate(const gsd_field *field)
@@ -3695,6 +3708,7 @@ GSD_API gsd_result gsd_merge(gsd_field *field, const gsd_field *source)
         double both = s->fresh + o->fresh, share = both > 0 ? o->fresh / both : 0;
         s->held += o->held;
         s->fresh += o->fresh;
+        s->flow += o->flow;
         s->gate_count += o->gate_count;
         s->weight += o->weight;
         s->pixel += o->pixel;

@@ -10,9 +10,7 @@
 
 #include <stdio.h>
 
-#define SIZE 96
-#define PASSES 7 /* of 2, 4, 8 ... paths per pixel */
-#define DEPTH 12
+enum { SIZE = 96, PASSES = 7, DEPTH = 12 }; /* pixels across, passes of 2, 4, 8 ... paths per pixel, path length */
 #define ALBEDO 0.7f
 
 static const float room[3] = {2, 1, 1}; /* corner opposite to the origin */

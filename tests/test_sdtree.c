@@ -347,8 +347,8 @@ static void test_sizes_are_as_documented(void **state)
     (void)state;
     assert_int_equal(sizeof(gsd_node), 16);
     assert_int_equal(sizeof(gsd_alias), 12);
-    assert_int_equal(sizeof(gsd_cell), 32);
-    assert_int_equal(sizeof(gsd_handle), 24);
+    assert_int_equal(sizeof(gsd_cell), 36);
+    assert_int_equal(sizeof(gsd_handle), 28);
     assert_int_equal(sizeof(gsd_training_sample), 48);
     assert_int_equal(sizeof(gsdi_tree), 32);
     assert_true(sizeof(gsdi_state) < 600);

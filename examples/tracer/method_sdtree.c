@@ -264,6 +264,16 @@ static void sdtree_pdf(void *method, int n, const int *index, const void *handle
     gsd_pdf_batch(&m->view, (uint32_t)n, (const uint32_t *)index, handles, &wi->x, sizeof *wi, pdf);
 }
 
+/* Not told where nothing guides: such a field must not change a bit of the picture. */
+static void sdtree_reflected(void *method, int n, const void *handles, float *radiance)
+{
+    const sdtree *m = method;
+    const gsd_handle *h = handles;
+    bool closed = gsd_all_closed(m->field);
+    for (int i = 0; i < n; ++i)
+        radiance[i] = closed ? 0 : h[i].reflected;
+}
+
 /* ---- reports */
 
 /* Cell number, and depth of the leaf that the normal +z points into. */
@@ -320,6 +330,7 @@ const tr_method tr_method_sdtree = {.name = "sdtree",
                                     .find = sdtree_find,
                                     .sample = sdtree_sample,
                                     .pdf = sdtree_pdf,
+                                    .reflected = sdtree_reflected,
                                     .record = sdtree_record,
                                     .wants_records = sdtree_wants_records,
                                     .flush = sdtree_flush,
