@@ -282,7 +282,7 @@ static void guided_agrees(const char *scene_name, const char *define, const char
 }
 
 static void guided_agrees_on_cornell(void **state) { (void)state, guided_agrees("cornell", NULL, NULL, 127, false); }
-static void guided_agrees_on_gloss(void **state) { (void)state, guided_agrees("gloss", NULL, NULL, 127, true); }
+static void guided_agrees_on_gloss(void **state) { (void)state, guided_agrees("gloss", "bulb", "0.3", 127, true); }
 
 /* ---- >>identical -------------------------------------------------------------------------------------------- */
 
