@@ -54,10 +54,8 @@ static inline double sf1_dot(const double *a, const double *b) { return a[0] * b
 
 static inline void sf1_make_point(sf1_rng *rng, sf1_point *p)
 {
-    static const double source[SF1_SOURCES][5] = {{.5, .98, .5, .20, 14.4},
-                                                  {.15, .5, .85, .08, 56.25},
-                                                  {.02, .3, .4, .30, 3},
-                                                  {.98, .7, .2, .12, 44.4}};
+    static const double source[SF1_SOURCES][5] = {
+        {.5, .98, .5, .20, 14.4}, {.15, .5, .85, .08, 56.25}, {.02, .3, .4, .30, 3}, {.98, .7, .2, .12, 44.4}};
     int k = (int)(6 * sf1_uniform(rng)), axis = k >> 1, side = k & 1;
     for (int i = 0; i < 3; ++i) {
         p->x[i] = i == axis ? side : sf1_uniform(rng);

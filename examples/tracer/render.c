@@ -26,22 +26,23 @@ typedef struct options {
     bool quiet, list;
 } options;
 
-static const char usage_text[] = "usage: render SCENE.xml|SCENE.gltf|SCENE.glb [options]\n"
-                                 "  --method NAME         pt (default), sdtree\n"
-                                 "  --set key=value       option of the method (repeatable)\n"
-                                 "  --spp N               budget in samples per pixel, or\n"
-                                 "  --seconds S           budget in CPU seconds over all threads, learning included\n"
-                                 "  --size WxH            picture size (default: the scene's)\n"
-                                 "  --max-depth D         path edges, 1 = emitted light only (default: the scene's)\n"
-                                 "  --nee on|off          next event estimation (default on)\n"
-                                 "  --rr guided|off|on    Russian roulette: by what the guide expects (default; pt: off), none, by throughput\n"
-                                 "  --seed N, --threads N\n"
-                                 "  -D name=value         value for $name in the scene file (repeatable)\n"
-                                 "  --reference R.exr     print errors against R; R may be larger by a whole factor\n"
-                                 "  -o OUT.exr            layers: color, variance, albedo, normal, alpha, cell, depth\n"
-                                 "  --png OUT.png         tone-mapped picture   [--exposure E]\n"
-                                 "  --json FILE           statistics\n"
-                                 "  --quiet               no progress\n";
+static const char usage_text[] =
+    "usage: render SCENE.xml|SCENE.gltf|SCENE.glb [options]\n"
+    "  --method NAME         pt (default), sdtree\n"
+    "  --set key=value       option of the method (repeatable)\n"
+    "  --spp N               budget in samples per pixel, or\n"
+    "  --seconds S           budget in CPU seconds over all threads, learning included\n"
+    "  --size WxH            picture size (default: the scene's)\n"
+    "  --max-depth D         path edges, 1 = emitted light only (default: the scene's)\n"
+    "  --nee on|off          next event estimation (default on)\n"
+    "  --rr guided|off|on    Russian roulette: by what the guide expects (default; pt: off), none, by throughput\n"
+    "  --seed N, --threads N\n"
+    "  -D name=value         value for $name in the scene file (repeatable)\n"
+    "  --reference R.exr     print errors against R; R may be larger by a whole factor\n"
+    "  -o OUT.exr            layers: color, variance, albedo, normal, alpha, cell, depth\n"
+    "  --png OUT.png         tone-mapped picture   [--exposure E]\n"
+    "  --json FILE           statistics\n"
+    "  --quiet               no progress\n";
 
 /* ---- >>options ---------------------------------------------------------------------------------------------- */
 

@@ -464,8 +464,9 @@ const tr_method *const *tr_method_list(void);      /* NULL-terminated */
 
 /* ---- >>render ----------------------------------------------------------------------------------------------- */
 
-/* Guided roulette compares what a vertex is expected to add with what its pixel needs (Vorba and Krivanek 2016); it asks
-   the method, and is off where the method cannot tell. Throughput: the product of albedos, from the 5th edge on. */
+/* Guided roulette compares what a vertex is expected to add with what its pixel needs (Vorba and Krivanek 2016); it
+   asks the method, and is off where the method cannot tell. Throughput: the product of albedos, from the 5th edge on.
+ */
 typedef enum tr_roulette { TR_ROULETTE_GUIDED, TR_ROULETTE_OFF, TR_ROULETTE_THROUGHPUT } tr_roulette;
 
 typedef struct tr_settings {
