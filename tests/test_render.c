@@ -10,6 +10,13 @@
 
 #define SCENES "examples/scenes/"
 
+/* Sanitizers slow rendering down by an order of magnitude; they look for other things than noise. */
+#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
+#define SPP(n) ((n) / 8)
+#else
+#define SPP(n) (n)
+#endif
+
 /* ---- >>tools ------------------------------------------------------------------------------------------------ */
 
 static tr_scene *load(const char *name, const char *define, const char *value)
@@ -242,7 +249,7 @@ static void furnace_is_white(void **state)
 static void estimators_agree(const char *scene_name, const char *define, const char *value, int spp)
 {
     tr_scene *scene = load(scene_name, define, value);
-    tr_settings s = small("pt", spp);
+    tr_settings s = small("pt", SPP(spp));
     tr_result mis = render(scene, &s);
     s.no_bsdf_hits = true;
     s.seed = 1;
@@ -250,7 +257,7 @@ static void estimators_agree(const char *scene_name, const char *define, const c
     s.no_bsdf_hits = false;
     s.no_nee = true;
     s.seed = 2;
-    s.spp = 4 * spp;
+    s.spp = 4 * SPP(spp);
     tr_result bsdf = render(scene, &s);
     assert_agree("MIS and NEE only", &mis, &nee);
     assert_agree("MIS and BSDF only", &mis, &bsdf);
@@ -269,7 +276,7 @@ static void estimators_agree_on_gloss(void **state) { (void)state, estimators_ag
 static void guided_agrees(const char *scene_name, const char *define, const char *value, int spp, bool nee)
 {
     tr_scene *scene = load(scene_name, define, value);
-    tr_settings s = small("pt", spp);
+    tr_settings s = small("pt", SPP(spp));
     s.no_nee = !nee;
     tr_result pt = render(scene, &s);
     s.method = tr_method_find("sdtree");

@@ -222,7 +222,8 @@ static int add_texture(gltf *g, const pixels *p, const int channels[3], bool srg
 static float number(const struct aiMaterial *m, const char *key, float fallback)
 {
     ai_real v = fallback;
-    return aiGetMaterialFloat(m, key, 0, 0, &v) == aiReturn_SUCCESS && isfinite(v) ? v : fallback;
+    /* The array form: the scalar one is inline without a symbol, and -O0 would not link. */
+    return aiGetMaterialFloatArray(m, key, 0, 0, &v, NULL) == aiReturn_SUCCESS && isfinite(v) ? v : fallback;
 }
 
 static tr_param constant(vec3 v)
