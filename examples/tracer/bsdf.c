@@ -209,7 +209,7 @@ static inline float unit_of(const tr_scene *scene, const tr_param *p, const tr_s
 
 /* The normal of the surface displaced along n by the bump texture (Blinn 1978): with the tangents made perpendicular
    to n, n' = (dpdu + n db/du) x (dpdv + n db/dv), on n's side. n where the tangents are degenerate. */
-static vec3 bump_normal(const tr_scene *scene, const tr_bsdf *b, const tr_surface *s, vec3 n)
+static TR_NOINLINE vec3 bump_normal(const tr_scene *scene, const tr_bsdf *b, const tr_surface *s, vec3 n)
 {
     if (b->bump_texture < 0)
         return n;
@@ -226,6 +226,13 @@ static vec3 bump_normal(const tr_scene *scene, const tr_bsdf *b, const tr_surfac
 
 /* Share given to the first of two strategies, a : b; 1 where b is 0. */
 static inline float share(float a, float b) { return b > 0 ? a / (a + b) : 1; }
+
+static inline bool prepare_diffuse(const tr_scene *scene, const tr_bsdf *b, const tr_surface *s, tr_closure *c)
+{
+    c->diffuse = color_of(scene, &b->reflectance, s);
+    c->roughness = 1;
+    return c->wo.z > 0 && !black3(c->diffuse);
+}
 
 static bool prepare_conductor(const tr_scene *scene, const tr_bsdf *b, const tr_surface *s, tr_closure *c)
 {
@@ -366,13 +373,12 @@ static bool prepare_pbr(const tr_scene *scene, const tr_bsdf *b, const tr_surfac
     return true;
 }
 
-static bool prepare_leaf(const tr_scene *scene, const tr_bsdf *b, const tr_surface *s, bool turned, tr_closure *c)
+static TR_NOINLINE bool prepare_leaf(const tr_scene *scene, const tr_bsdf *b, const tr_surface *s, bool turned,
+                                     tr_closure *c)
 {
     switch (b->type) {
     case TR_BSDF_DIFFUSE:
-        c->diffuse = color_of(scene, &b->reflectance, s);
-        c->roughness = 1;
-        return c->wo.z > 0 && !black3(c->diffuse);
+        return prepare_diffuse(scene, b, s, c);
     case TR_BSDF_CONDUCTOR:
     case TR_BSDF_ROUGHCONDUCTOR:
         return prepare_conductor(scene, b, s, c);
@@ -394,7 +400,7 @@ static bool prepare_leaf(const tr_scene *scene, const tr_bsdf *b, const tr_surfa
 
 /* Put a mask's gap around a closure: f is scaled by opacity, and the delta part gains the way straight through, taken
    with probability 1 - opacity overall. Only the gap is left where the child scatters nothing. */
-static bool apply_mask(tr_closure *c, float opacity, bool scatters)
+static TR_NOINLINE bool apply_mask(tr_closure *c, float opacity, bool scatters)
 {
     if (!scatters) {
         c->diffuse = c->specular = c->transmitted = v3s(0);
@@ -411,51 +417,98 @@ static bool apply_mask(tr_closure *c, float opacity, bool scatters)
     return true;
 }
 
-bool tr_closure_prepare(const tr_scene *scene, const tr_surface *surface, vec3 wo, tr_closure *closure)
+void tr_closure_prefetch(const tr_scene *scene, const tr_surface *surface)
 {
-    tr_closure *c = closure;
-    int id = scene->shapes[surface->shape].bsdf;
-    const tr_bsdf *b = NULL;
-    vec3 n = surface->ns, base_n = n;
-    float opacity = 1;
-    bool turned = false, bumped = false;
-    for (int depth = 0; depth <= NESTING_MAX; depth++) {
-        if (id < 0)
-            return false;
-        b = &scene->bsdfs[id];
-        if (!nests(b->type))
-            break;
-        id = b->child[0];
+    int id = scene->shapes[surface->shape].bsdf, texture = id < 0 ? -1 : scene->bsdfs[id].first_texture;
+    if (texture >= 0)
+        tr_texture_prefetch(&scene->textures[texture], surface->u, surface->v);
+}
+
+/* What the bsdfs nested around a leaf do to it. */
+typedef struct nested {
+    vec3 n, base_n; /* turned; with and without the bump map */
+    float opacity;
+    bool turned, bumped;
+} nested;
+
+/* The leaf below bsdf b at a surface, NULL = none. */
+static const tr_bsdf *resolve(const tr_scene *scene, const tr_bsdf *b, const tr_surface *surface, vec3 wo, nested *out)
+{
+    for (int depth = 0; depth <= NESTING_MAX && nests(b->type); depth++) {
+        int id = b->child[0];
         if (b->type == TR_BSDF_TWOSIDED) {
-            if (dot3(n, wo) < 0) {
-                n = neg3(n);
-                base_n = neg3(base_n);
-                turned = !turned;
+            if (dot3(out->n, wo) < 0) {
+                out->n = neg3(out->n);
+                out->base_n = neg3(out->base_n);
+                out->turned = !out->turned;
                 if (b->child[1] >= 0)
                     id = b->child[1];
             }
         } else if (b->type == TR_BSDF_MASK) {
-            opacity *= unit_of(scene, &b->opacity, surface);
+            out->opacity *= unit_of(scene, &b->opacity, surface);
         } else {
-            n = bump_normal(scene, b, surface, n);
-            bumped = true;
+            out->n = bump_normal(scene, b, surface, out->n);
+            out->bumped = true;
         }
+        if (id < 0)
+            return NULL;
+        b = &scene->bsdfs[id];
     }
-    /* Not memset: most of what prepare_leaf leaves alone its type of closure never reads. */
-    c->diffuse = c->specular = c->transmitted = v3s(0);
-    c->specular_probability = c->delta_probability = c->gap_probability = c->roughness = 0;
-    c->bsdf = b;
+    return b;
+}
+
+/* The closure's type and frame. Not memset: most of what is left here its type of closure never reads. */
+static inline void start_closure(tr_closure *c, const tr_bsdf *b, vec3 n, vec3 base_n, vec3 wo, bool bumped)
+{
     c->type = (uint8_t)b->type;
     c->distribution = (uint8_t)b->distribution;
     c->nonlinear = b->nonlinear;
     c->transmits = 0;
     c->bumped = bumped;
+    c->specular = c->transmitted = v3s(0);
+    c->specular_probability = c->delta_probability = c->gap_probability = c->roughness = 0;
+    c->opacity = 1;
+    c->bsdf = b;
     c->frame = frame_from_normal(n);
     c->base_n = base_n;
     c->wo = to_local(&c->frame, wo);
-    c->opacity = 1;
-    bool scatters = opacity > 0 && prepare_leaf(scene, b, surface, turned, c);
-    return opacity < 1 ? apply_mask(c, opacity, scatters) : scatters;
+}
+
+/* With any nesting around the leaf. */
+static TR_NOINLINE bool prepare_nested(const tr_scene *scene, const tr_bsdf *outer, const tr_surface *s, vec3 wo,
+                                       tr_closure *c)
+{
+    nested around = {s->ns, s->ns, 1, false, false};
+    const tr_bsdf *b = resolve(scene, outer, s, wo, &around);
+    if (!b)
+        return false;
+    start_closure(c, b, around.n, around.base_n, wo, around.bumped);
+    c->diffuse = v3s(0);
+    bool scatters = around.opacity > 0 && prepare_leaf(scene, b, s, around.turned, c);
+    return around.opacity < 1 ? apply_mask(c, around.opacity, scatters) : scatters;
+}
+
+bool tr_closure_prepare(const tr_scene *scene, const tr_surface *surface, vec3 wo, tr_closure *closure)
+{
+    tr_closure *c = closure;
+    int id = scene->shapes[surface->shape].bsdf;
+    if (id < 0)
+        return false;
+    const tr_bsdf *outer = &scene->bsdfs[id], *b = outer;
+    bool turned = false;
+    if (b->type == TR_BSDF_TWOSIDED) {
+        turned = dot3(surface->ns, wo) < 0;
+        b = &scene->bsdfs[b->child[turned && b->child[1] >= 0]];
+    }
+    if (nests(b->type))
+        return prepare_nested(scene, outer, surface, wo, c);
+    vec3 n = scale3(surface->ns, turned ? -1.0f : 1.0f);
+    start_closure(c, b, n, n, wo, false);
+    if (b->type != TR_BSDF_DIFFUSE) {
+        c->diffuse = v3s(0);
+        return prepare_leaf(scene, b, surface, turned, c);
+    }
+    return prepare_diffuse(scene, b, surface, c);
 }
 
 /* ---- delta part ----------------------------------------------------------------------------------------------- */

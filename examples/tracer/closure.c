@@ -132,6 +132,13 @@ static inline bool blocked(const tr_closure *c, vec3 wi, float local_z)
     return c->bumped && dot3(c->base_n, wi) * local_z <= 0;
 }
 
+/* Any type but the diffuse one. */
+static TR_NOINLINE vec3 eval_lobes(const tr_closure *c, vec3 wi, float *pdf)
+{
+    vec3 local = to_local(&c->frame, wi), f = eval_local(c, local, pdf);
+    return blocked(c, wi, local.z) ? v3s(0) : f;
+}
+
 vec3 tr_closure_eval(const tr_closure *closure, vec3 wi, float *pdf)
 {
     float unused;
@@ -140,16 +147,13 @@ vec3 tr_closure_eval(const tr_closure *closure, vec3 wi, float *pdf)
     *pdf = 0;
     if (closure->delta_probability >= 1)
         return v3s(0);
-    if (closure->type == TR_BSDF_DIFFUSE) { /* needs no more than the cosine */
-        float z = dot3(closure->frame.n, wi);
-        if (!(z > 0))
-            return v3s(0);
-        *pdf = z * TR_INV_PI;
-        return blocked(closure, wi, z) ? v3s(0) : scale3(closure->diffuse, TR_INV_PI);
-    }
-    vec3 local = to_local(&closure->frame, wi);
-    vec3 f = eval_local(closure, local, pdf);
-    return blocked(closure, wi, local.z) ? v3s(0) : f;
+    if (closure->type != TR_BSDF_DIFFUSE)
+        return eval_lobes(closure, wi, pdf);
+    float z = dot3(closure->frame.n, wi); /* most vertices need no more than the cosine */
+    if (!(z > 0))
+        return v3s(0);
+    *pdf = z * TR_INV_PI;
+    return blocked(closure, wi, z) ? v3s(0) : scale3(closure->diffuse, TR_INV_PI);
 }
 
 /* Around the mirrored wo with density (n + 1) / (2 pi) cos^n. */
@@ -176,19 +180,11 @@ static bool sample_roughdielectric(const tr_closure *c, vec3 m, float u_lobe, ve
     return wi->z < 0;
 }
 
-bool tr_closure_sample(const tr_closure *closure, float u_lobe, float u1, float u2, vec3 *wi, vec3 *f, float *pdf)
+/* Any type but the diffuse one. */
+static TR_NOINLINE bool sample_lobes(const tr_closure *c, float u_lobe, float u1, float u2, vec3 *wi, vec3 *f,
+                                     float *pdf)
 {
-    const tr_closure *c = closure;
     vec3 local, m;
-    if (c->delta_probability >= 1)
-        return false;
-    if (c->type == TR_BSDF_DIFFUSE) { /* most vertices: no need to go through eval_local */
-        local = sample_cosine_hemisphere(u1, u2);
-        *wi = to_world(&c->frame, local);
-        *f = blocked(c, *wi, local.z) ? v3s(0) : scale3(c->diffuse, TR_INV_PI);
-        *pdf = local.z * TR_INV_PI;
-        return local.z > 0;
-    }
     switch (c->type) {
     case TR_BSDF_ROUGHCONDUCTOR:
     case TR_BSDF_ROUGHPLASTIC:
@@ -219,4 +215,18 @@ bool tr_closure_sample(const tr_closure *closure, float u_lobe, float u1, float 
     if (blocked(c, *wi, local.z))
         *f = v3s(0);
     return *pdf > 0;
+}
+
+bool tr_closure_sample(const tr_closure *closure, float u_lobe, float u1, float u2, vec3 *wi, vec3 *f, float *pdf)
+{
+    const tr_closure *c = closure;
+    if (c->delta_probability >= 1)
+        return false;
+    if (c->type != TR_BSDF_DIFFUSE)
+        return sample_lobes(c, u_lobe, u1, u2, wi, f, pdf);
+    vec3 local = sample_cosine_hemisphere(u1, u2); /* most vertices */
+    *wi = to_world(&c->frame, local);
+    *f = blocked(c, *wi, local.z) ? v3s(0) : scale3(c->diffuse, TR_INV_PI);
+    *pdf = local.z * TR_INV_PI;
+    return local.z > 0;
 }

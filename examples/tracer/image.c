@@ -4,11 +4,13 @@
 
    Files are read into memory before anything parses them and are built in memory before anything is written: the
    parsers then see one bounded block, and a failed write gives the system's own reason. */
+#define _DEFAULT_SOURCE /* madvise */
 #include "tracer.h"
 
 #include <errno.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/mman.h>
 
 #include <OpenEXR/openexr.h>
 #include <stb/stb_image.h>
@@ -39,6 +41,20 @@ static bool size_allowed(int64_t width, int64_t height)
 {
     return width > 0 && height > 0 && width <= IMAGE_MAX_SIDE && height <= IMAGE_MAX_SIDE &&
            width * height <= IMAGE_MAX_PIXELS;
+}
+
+void *tr_alloc_pages(size_t size)
+{
+    const size_t page = (size_t)1 << 21;
+    void *p = NULL;
+    if (size > SIZE_MAX - page || posix_memalign(&p, size < page ? 64 : page, size ? size : 1) != 0)
+        return NULL;
+#if defined(MADV_HUGEPAGE)
+    if (size >= page)
+        madvise(p, size / page * page, MADV_HUGEPAGE); /* only advice: failing changes nothing */
+#endif
+    memset(p, 0, size);
+    return p;
 }
 
 bool tr_image_alloc(tr_image *image, int width, int height, int channels)

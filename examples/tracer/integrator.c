@@ -27,6 +27,7 @@ typedef struct path {
     float pdf;      /* of `direction` by the mixture; meaningless after a delta bounce */
     float survival; /* product of albedos and eta^2: what roulette looks at, since guided throughput is small exactly
                        where light is expected */
+    float roulette; /* weight for having survived at this vertex */
     bool specular;  /* the last bounce was a delta one, or there was none */
     bool seen;      /* a non-delta vertex has been met */
     int x, y;
@@ -52,7 +53,6 @@ struct tr_worker {
     struct RTCRayHit hits[TR_BATCH];
     tr_surface surfaces[TR_BATCH];
     tr_closure closures[TR_BATCH];
-    float probability[TR_BATCH]; /* roulette: survival at this vertex */
     /* Vertices with a smooth part, by their place k in the lookup. */
     int smooth[TR_BATCH], smooth_count;
     int place[TR_BATCH]; /* path -> k, -1 = none */
@@ -72,12 +72,13 @@ struct tr_worker {
     int vertex_count, vertex_capacity, link_count, link_capacity;
 };
 
+#define WORKER_PAGE ((size_t)1 << 21) /* fill a large page, so that all of a worker is one page away */
+
 tr_worker *tr_worker_create(const tr_frame *frame)
 {
-    tr_worker *w = NULL;
-    if (posix_memalign((void **)&w, 64, sizeof *w) != 0)
+    tr_worker *w = tr_alloc_pages(sizeof *w > WORKER_PAGE ? sizeof *w : WORKER_PAGE);
+    if (!w)
         return NULL;
-    memset(w, 0, sizeof *w);
     size_t handle_size = frame->method->handle_size ? frame->method->handle_size : 1;
     if (posix_memalign(&w->handles, 64, handle_size * TR_BATCH) != 0) {
         free(w);
@@ -192,7 +193,7 @@ static void start_paths(tr_worker *w, const tr_frame *frame, int tile, int sampl
             p->guide_rng = rng_seed(frame->settings->seed, 2 * stream + 1);
             p->throughput = v3s(1);
             p->radiance = v3s(0);
-            p->survival = 1;
+            p->survival = p->roulette = 1;
             p->pdf = 0;
             p->specular = true;
             p->seen = false;
@@ -270,44 +271,57 @@ static link *push_link(tr_worker *w, path *p)
     return l;
 }
 
-/* Emission of whatever the ray met; then the closure there. Paths that end are dropped from the active list. */
+/* The surface that path id met, and what it emits. Returns whether the path can scatter there. */
+static bool meet(tr_worker *w, const tr_frame *frame, int id, int depth, bool recording)
+{
+    const tr_scene *scene = frame->scene;
+    path *p = &w->paths[id];
+    const struct RTCRayHit *hit = &w->hits[id];
+    tr_surface *s = &w->surfaces[id];
+    bool met = hit->hit.geomID != RTC_INVALID_GEOMETRY_ID;
+    vec3 emitted = v3s(0);
+    bool visible = depth > 0 || !scene->hide_emitters;
+    if (met) {
+        tr_surface_from_hit_lean(scene, hit, s);
+        if (scene->shapes[s->shape].light >= 0 && visible)
+            emitted = tr_surface_emission(scene, s, neg3(p->direction));
+    } else if (visible && scene->environment_count) {
+        emitted = tr_environment(scene, p->direction);
+    }
+    if (!black3(emitted)) {
+        emitted = scale3(emitted, emission_weight(frame, p, met ? s : NULL));
+        add_radiance(p, emitted);
+    }
+    if (recording) {
+        link *l = push_link(w, p);
+        l->emitted = emitted;
+        l->environment = !met;
+        l->distance = met ? s->t : INFINITY;
+        l->normal = met ? s->ng : v3s(0);
+    }
+    return met && depth + 1 < frame->max_depth;
+}
+
+/* Emission of whatever the rays met; then the closures there, in a second loop so that textures have time to come from
+   memory. Paths that end are dropped from the active list. */
 static void arrive(tr_worker *w, const tr_frame *frame, int depth, bool recording)
 {
     const tr_scene *scene = frame->scene;
-    int kept = 0;
+    int met = 0, kept = 0;
     for (int i = 0; i < w->active_count; ++i) {
         int id = w->active[i];
         if (i + 16 < w->active_count)
             tr_surface_prefetch(scene, &w->hits[w->active[i + 16]], 0);
         if (i + 8 < w->active_count)
             tr_surface_prefetch(scene, &w->hits[w->active[i + 8]], 1);
-        path *p = &w->paths[id];
-        const struct RTCRayHit *hit = &w->hits[id];
-        tr_surface *s = &w->surfaces[id];
-        bool met = hit->hit.geomID != RTC_INVALID_GEOMETRY_ID;
-        vec3 emitted = v3s(0);
-        bool visible = depth > 0 || !scene->hide_emitters;
-        if (met) {
-            tr_surface_from_hit_lean(scene, hit, s);
-            if (scene->shapes[s->shape].light >= 0 && visible)
-                emitted = tr_surface_emission(scene, s, neg3(p->direction));
-        } else if (visible && scene->environment_count) {
-            emitted = tr_environment(scene, p->direction);
+        if (meet(w, frame, id, depth, recording)) {
+            tr_closure_prefetch(scene, &w->surfaces[id]);
+            w->active[met++] = id;
         }
-        if (!black3(emitted)) {
-            emitted = scale3(emitted, emission_weight(frame, p, met ? s : NULL));
-            add_radiance(p, emitted);
-        }
-        if (recording) {
-            link *l = push_link(w, p);
-            l->emitted = emitted;
-            l->environment = !met;
-            l->distance = met ? s->t : INFINITY;
-            l->normal = met ? s->ng : v3s(0);
-        }
-        if (!met || depth + 1 >= frame->max_depth)
-            continue;
-        if (tr_closure_prepare(scene, s, neg3(p->direction), &w->closures[id]))
+    }
+    for (int i = 0; i < met; ++i) {
+        int id = w->active[i];
+        if (tr_closure_prepare(scene, &w->surfaces[id], neg3(w->paths[id].direction), &w->closures[id]))
             w->active[kept++] = id;
     }
     w->active_count = kept;
@@ -403,7 +417,8 @@ static void sample_lights(tr_worker *w, const tr_frame *frame)
         int id = w->smooth[k];
         path *p = &w->paths[id];
         tr_light_sample *l = &w->lights[k];
-        float u0 = rng_float(&p->rng), u1 = rng_float(&p->rng), u2 = rng_float(&p->rng);
+        float u0 = rng_float(&p->rng), u1, u2;
+        rng_float2(&p->rng, &u1, &u2);
         w->pdf_guide[k] = 0;
         if (!tr_light_sample_direction(frame->scene, w->surfaces[id].p, u0, u1, u2, l) || !(l->pdf > 0)) {
             l->pdf = 0;
@@ -506,14 +521,12 @@ static void roulette(tr_worker *w, const tr_frame *frame, int depth)
     bool guided = mode == TR_ROULETTE_GUIDED && frame->estimate && frame->method->reflected && w->smooth_count > 0;
     if (guided)
         frame->method->reflected(frame->method_data, w->smooth_count, w->handles, w->reflected);
+    else if (mode != TR_ROULETTE_THROUGHPUT)
+        return;
     for (int i = 0; i < w->active_count; ++i) {
         int id = w->active[i];
-        float q = 1;
-        if (guided)
-            q = guided_survival(w, frame, id);
-        else if (mode == TR_ROULETTE_THROUGHPUT)
-            q = throughput_survival(w, id, depth);
-        w->probability[id] = q;
+        float q = guided ? guided_survival(w, frame, id) : throughput_survival(w, id, depth);
+        w->paths[id].roulette = 1 / q;
         if (q < 1 && rng_float(guided ? &w->paths[id].guide_rng : &w->paths[id].rng) >= q)
             continue;
         w->active[kept++] = id;
@@ -523,49 +536,52 @@ static void roulette(tr_worker *w, const tr_frame *frame, int depth)
 
 /* A direction chosen at a vertex. */
 typedef struct choice {
-    vec3 wi, f;
-    float pdf_bsdf;
+    vec3 wi, f;     /* delta: f cos / probability instead of f */
+    float pdf_bsdf; /* delta: square of the relative index instead */
     uint8_t kind;
 } choice;
 enum { CHOICE_NONE, CHOICE_DELTA, CHOICE_BSDF, CHOICE_GUIDE };
 
-/* Decide delta, bsdf or guide; draw what needs no method. Returns how many entries index lists (guide choices). */
-static int choose(tr_worker *w, choice *choices, vec3 *delta_weight, float *delta_eta)
+/* Decide delta, bsdf or guide; draw what needs no method. */
+static inline void choose(tr_worker *w, int id, choice *ch)
 {
-    int guided = 0;
-    for (int i = 0; i < w->active_count; ++i) {
-        int id = w->active[i], k = w->place[id];
-        path *p = &w->paths[id];
-        const tr_closure *c = &w->closures[id];
-        choice *ch = &choices[id];
-        float u0 = rng_float(&p->rng), u1 = rng_float(&p->rng), u2 = rng_float(&p->rng), u3 = rng_float(&p->rng);
-        ch->kind = CHOICE_NONE;
-        if (u0 < c->delta_probability) {
-            if (tr_closure_sample_delta(c, u1, &ch->wi, &delta_weight[id], &delta_eta[id]))
-                ch->kind = CHOICE_DELTA;
-            continue;
-        }
-        if (k < 0)
-            continue;
-        if (w->alpha[k] < 1) {
-            float choose_u = rng_float(&p->guide_rng);
-            w->sample_u[k][0] = rng_float(&p->guide_rng);
-            w->sample_u[k][1] = rng_float(&p->guide_rng);
-            if (choose_u >= w->alpha[k]) {
-                ch->kind = CHOICE_GUIDE;
-                w->index[guided++] = k;
-                continue;
-            }
-        }
-        if (tr_closure_sample(c, u1, u2, u3, &ch->wi, &ch->f, &ch->pdf_bsdf))
-            ch->kind = CHOICE_BSDF;
+    path *p = &w->paths[id];
+    const tr_closure *c = &w->closures[id];
+    float u0, u1, u2, u3;
+    rng_float2(&p->rng, &u0, &u1);
+    rng_float2(&p->rng, &u2, &u3);
+    ch->kind = CHOICE_NONE;
+    if (u0 < c->delta_probability) {
+        if (tr_closure_sample_delta(c, u1, &ch->wi, &ch->f, &ch->pdf_bsdf))
+            ch->kind = CHOICE_DELTA;
+        return;
     }
-    return guided;
+    int k = w->place[id];
+    if (k < 0)
+        return;
+    if (w->alpha[k] < 1) {
+        float choose_u = rng_float(&p->guide_rng);
+        w->sample_u[k][0] = rng_float(&p->guide_rng);
+        w->sample_u[k][1] = rng_float(&p->guide_rng);
+        if (choose_u >= w->alpha[k]) {
+            ch->kind = CHOICE_GUIDE;
+            return;
+        }
+    }
+    if (tr_closure_sample(c, u1, u2, u3, &ch->wi, &ch->f, &ch->pdf_bsdf))
+        ch->kind = CHOICE_BSDF;
 }
 
-/* Complete the guided choices (f and bsdf pdf) and the guide's pdf of bsdf choices. */
-static void complete_choices(tr_worker *w, const tr_frame *frame, choice *choices, int guided)
+/* Make all choices and complete the guided ones (f and bsdf pdf) and the guide's pdf of bsdf choices. */
+static void choose_guided(tr_worker *w, const tr_frame *frame, choice *choices)
 {
+    int guided = 0, asked = 0;
+    for (int i = 0; i < w->active_count; ++i) {
+        int id = w->active[i];
+        choose(w, id, &choices[id]);
+        if (choices[id].kind == CHOICE_GUIDE)
+            w->index[guided++] = w->place[id];
+    }
     if (guided) {
         double start = tr_wall_seconds();
         frame->method->sample(frame->method_data, guided, w->index, w->handles, (const float(*)[2])w->sample_u, w->wi,
@@ -578,7 +594,6 @@ static void complete_choices(tr_worker *w, const tr_frame *frame, choice *choice
             ch->f = w->pdf_guide[k] > 0 ? tr_closure_eval(&w->closures[id], ch->wi, &ch->pdf_bsdf) : v3s(0);
         }
     }
-    int asked = 0;
     for (int i = 0; i < w->active_count; ++i) {
         int id = w->active[i], k = w->place[id];
         if (choices[id].kind == CHOICE_BSDF && w->alpha[k] < 1) {
@@ -627,46 +642,55 @@ static void fill_vertex(tr_worker *w, const tr_frame *frame, int id, const choic
     v->L = v3s(0);
 }
 
-/* Turn the choices into next rays. */
+/* Turn a choice into the next ray; false = the path ends. */
+static inline bool follow(tr_worker *w, const tr_frame *frame, int id, const choice *ch, bool recording)
+{
+    path *p = &w->paths[id];
+    const tr_closure *c = &w->closures[id];
+    float pdf = 0;
+    vec3 weight;
+    if (ch->kind == CHOICE_NONE)
+        return false;
+    if (ch->kind == CHOICE_DELTA) {
+        weight = scale3(ch->f, p->roulette / c->delta_probability);
+        p->survival *= ch->pdf_bsdf;
+    } else {
+        int k = w->place[id];
+        pdf = mixture(c, w->alpha[k], ch->pdf_bsdf, w->pdf_guide[k]);
+        float cosine = fabsf(dot3(c->frame.n, ch->wi));
+        if (!(pdf > 0))
+            return false;
+        weight = scale3(ch->f, p->roulette * cosine / pdf);
+        if (recording)
+            fill_vertex(w, frame, id, ch, cosine, pdf, scale3(p->throughput, p->roulette));
+    }
+    if (!finite3(weight) || max3(weight) <= 0)
+        return false;
+    if (recording)
+        w->links[p->last].weight = weight;
+    p->throughput = mul3(p->throughput, weight);
+    p->roulette = 1;
+    p->specular = ch->kind == CHOICE_DELTA;
+    p->seen |= ch->kind != CHOICE_DELTA;
+    p->pdf = pdf;
+    p->direction = ch->wi;
+    p->origin = leave_surface(frame->scene, &w->surfaces[id], ch->wi);
+    return true;
+}
+
 static void scatter(tr_worker *w, const tr_frame *frame, bool recording)
 {
     choice choices[TR_BATCH];
-    vec3 delta_weight[TR_BATCH];
-    float delta_eta[TR_BATCH];
-    complete_choices(w, frame, choices, choose(w, choices, delta_weight, delta_eta));
+    bool guiding = frame->method->find != NULL;
+    if (guiding)
+        choose_guided(w, frame, choices);
     int kept = 0;
     for (int i = 0; i < w->active_count; ++i) {
-        int id = w->active[i], k = w->place[id];
-        path *p = &w->paths[id];
-        const tr_closure *c = &w->closures[id];
-        const choice *ch = &choices[id];
-        float roulette_weight = 1 / w->probability[id], cosine = 1, pdf = 0;
-        vec3 weight, before = p->throughput;
-        if (ch->kind == CHOICE_NONE)
-            continue;
-        if (ch->kind == CHOICE_DELTA) {
-            weight = scale3(delta_weight[id], roulette_weight / c->delta_probability);
-            p->survival *= delta_eta[id];
-        } else {
-            pdf = mixture(c, w->alpha[k], ch->pdf_bsdf, w->pdf_guide[k]);
-            cosine = fabsf(dot3(c->frame.n, ch->wi));
-            if (!(pdf > 0))
-                continue;
-            weight = scale3(ch->f, roulette_weight * cosine / pdf);
-            if (recording)
-                fill_vertex(w, frame, id, ch, cosine, pdf, scale3(before, roulette_weight));
-        }
-        if (!finite3(weight) || max3(weight) <= 0)
-            continue;
-        if (recording)
-            w->links[p->last].weight = weight;
-        p->throughput = mul3(p->throughput, weight);
-        p->specular = ch->kind == CHOICE_DELTA;
-        p->seen |= ch->kind != CHOICE_DELTA;
-        p->pdf = pdf;
-        p->direction = ch->wi;
-        p->origin = leave_surface(frame->scene, &w->surfaces[id], ch->wi);
-        w->active[kept++] = id;
+        int id = w->active[i];
+        if (!guiding) /* nobody to ask in between: the vertex stays in the nearest cache */
+            choose(w, id, &choices[0]);
+        if (follow(w, frame, id, &choices[guiding ? id : 0], recording))
+            w->active[kept++] = id;
     }
     w->active_count = kept;
 }

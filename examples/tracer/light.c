@@ -122,7 +122,7 @@ static float envmap_pdf(const tr_light *light, vec3 direction)
     return envmap_local_pdf(light, (uint32_t)x, (uint32_t)y) * fabsf(det) * inverse * inverse * inverse;
 }
 
-static vec3 envmap_sample(const tr_light *light, float u1, float u2)
+static TR_NOINLINE vec3 envmap_sample(const tr_light *light, float u1, float u2)
 {
     uint32_t w = (uint32_t)light->image.width, h = (uint32_t)light->image.height;
     uint32_t y = cdf_find(light->marginal, h, u2);
@@ -297,11 +297,12 @@ bool tr_lights_finish(tr_scene *scene, tr_log *log)
 /* ---- >>cone ------------------------------------------------------------------------------------------------- */
 
 /* Uniform directions within a cone. one_minus_cos rather than the cosine: a narrow cone has none to spare. */
-static vec3 cone_sample(vec3 axis, float one_minus_cos, float u1, float u2)
+static TR_NOINLINE vec3 cone_sample(vec3 axis, float one_minus_cos, float u1, float u2)
 {
     frame3 f = frame_from_normal(axis);
-    float x = u1 * one_minus_cos, s = sqrtf(fmaxf(0, x * (2 - x))), phi = 2 * TR_PI * u2;
-    return norm3(to_world(&f, v3(s * cosf(phi), s * sinf(phi), 1 - x)));
+    float x = u1 * one_minus_cos, s = sqrtf(tr_max(0, x * (2 - x))), sine, cosine;
+    sincos_turn(u2, &sine, &cosine);
+    return norm3(to_world(&f, v3(s * cosine, s * sine, 1 - x)));
 }
 
 static float cone_pdf(float one_minus_cos) { return 1.0f / (2 * TR_PI * one_minus_cos); }
@@ -321,18 +322,23 @@ typedef struct area_point {
     float pdf;
 } area_point;
 
-static void mesh_point(const tr_shape *shape, float u_extra, float u1, float u2, area_point *out)
+/* A point on a mesh, unless the triangle drawn turns its back to `to`: the whole triangle then does, and since that is
+   the most common answer it is found out first. */
+static bool mesh_point(const tr_shape *shape, vec3 to, float u_extra, float u1, float u2, area_point *out)
 {
     uint32_t i = cdf_find(shape->area_cdf, shape->triangle_count, u1);
+    const tr_emitter *e = &shape->emitters[i];
+    if (!(dot3(e->n, sub3(to, e->p)) > 0))
+        return false;
     /* u_extra, what choosing the light left over, refills the low bits of u1 that choosing the triangle used up. */
     float width = shape->area_cdf[i + 1] - shape->area_cdf[i];
     float a = width > 0 ? (u1 - shape->area_cdf[i] + u_extra * 0x1p-24f) / width : 0;
     a = clampf(a, 0, 1);
-    const tr_emitter *e = &shape->emitters[i];
     float s = sqrtf(a), b1 = s * (1 - u2), b2 = s * u2;
     out->p = madd3(madd3(e->p, e->e1, b1), e->e2, b2);
     out->ng = e->n;
     out->pdf = 1.0f / shape->area;
+    return true;
 }
 
 /* Area of the world per unit of (phi, z) around a local point of the cylinder; not constant where the transform scales
@@ -353,29 +359,29 @@ static float shape_area_pdf(const tr_shape *shape, vec3 p)
     return r > 0 ? 1.0f / (2 * TR_PI * cylinder_stretch(shape, l.x / r, l.y / r)) : 0;
 }
 
-static void shape_point(const tr_shape *shape, float u_extra, float u1, float u2, area_point *out)
+static TR_NOINLINE void analytic_point(const tr_shape *shape, float u1, float u2, area_point *out)
 {
-    float phi = 2 * TR_PI * u2;
+    float sine, cosine;
     vec3 n = v3(0, 0, 1);
+    sincos_turn(u2, &sine, &cosine);
     switch (shape->type) {
-    case TR_SHAPE_MESH:
-        mesh_point(shape, u_extra, u1, u2, out);
-        return;
     case TR_SHAPE_SPHERE:
         n = sample_uniform_sphere(u1, u2);
         out->p = madd3(shape->center, n, shape->radius);
         out->pdf = 1.0f / (4 * TR_PI * shape->radius * shape->radius);
         break;
     case TR_SHAPE_DISK:
-        out->p = xform_point(&shape->object_to_world, v3(sqrtf(u1) * cosf(phi), sqrtf(u1) * sinf(phi), 0));
+        out->p = xform_point(&shape->object_to_world, v3(sqrtf(u1) * cosine, sqrtf(u1) * sine, 0));
         out->pdf = 1.0f / shape->area;
         n = norm3(xform_normal(&shape->world_to_object, n));
         break;
     case TR_SHAPE_CYLINDER:
-        n = v3(cosf(phi), sinf(phi), 0);
+        n = v3(cosine, sine, 0);
         out->p = xform_point(&shape->object_to_world, v3(n.x, n.y, u1));
         out->pdf = 1.0f / (2 * TR_PI * cylinder_stretch(shape, n.x, n.y));
         n = norm3(xform_normal(&shape->world_to_object, n));
+        break;
+    default:
         break;
     }
     out->ng = shape->flip_normals ? neg3(n) : n;
@@ -394,7 +400,7 @@ static float sphere_cone(const tr_shape *shape, vec3 p, float *distance2)
     return sin2 / (1 + sqrtf(1 - sin2));
 }
 
-static bool sphere_sample(const tr_shape *shape, vec3 p, float u1, float u2, tr_light_sample *sample)
+static TR_NOINLINE bool sphere_sample(const tr_shape *shape, vec3 p, float u1, float u2, tr_light_sample *sample)
 {
     float d2, cone = sphere_cone(shape, p, &d2);
     if (!(cone > 0))
@@ -416,10 +422,13 @@ static bool area_sample(const tr_scene *scene, const tr_light *light, vec3 p, fl
     if (shape->type == TR_SHAPE_SPHERE && !shape->flip_normals)
         return sphere_sample(shape, p, u1, u2, sample);
     area_point point = {0};
-    shape_point(shape, u_extra, u1, u2, &point);
+    if (shape->type != TR_SHAPE_MESH)
+        analytic_point(shape, u1, u2, &point);
+    else if (!mesh_point(shape, p, u_extra, u1, u2, &point))
+        return false;
     vec3 d = sub3(point.p, p);
     float d2 = dot3(d, d), facing = -dot3(point.ng, d);
-    if (!(facing > 0 && d2 > 0)) /* the most common answer, hence first */
+    if (!(facing > 0 && d2 > 0))
         return false;
     sample->distance = sqrtf(d2);
     sample->wi = scale3(d, 1 / sample->distance);
@@ -429,7 +438,7 @@ static bool area_sample(const tr_scene *scene, const tr_light *light, vec3 p, fl
 
 /* ---- >>queries ---------------------------------------------------------------------------------------------- */
 
-static float environment_pdf(const tr_scene *scene, vec3 wi)
+static TR_NOINLINE float environment_pdf(const tr_scene *scene, vec3 wi)
 {
     float pdf = 0;
     for (int i = 0; i < scene->environment_count; ++i) {
@@ -458,7 +467,7 @@ static float spot_falloff(const tr_light *light, float cosine)
 }
 
 /* Point, spot and directional lights: one direction. */
-static bool delta_sample(const tr_light *light, vec3 p, tr_light_sample *sample)
+static TR_NOINLINE bool delta_sample(const tr_light *light, vec3 p, tr_light_sample *sample)
 {
     sample->delta = true;
     sample->pdf = 1;

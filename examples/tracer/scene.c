@@ -119,9 +119,12 @@ void tr_scene_free(tr_scene *scene)
     for (int i = 0; i < scene->texture_count; ++i) {
         /* Textures of one file share its pixels: the first frees them. */
         for (int j = i + 1; j < scene->texture_count; ++j)
-            if (scene->textures[j].image.data == scene->textures[i].image.data)
+            if (scene->textures[j].image.data == scene->textures[i].image.data) {
                 scene->textures[j].image.data = NULL;
+                scene->textures[j].texels = NULL;
+            }
         tr_image_free(&scene->textures[i].image);
+        tr_texels_free(scene->textures[i].texels);
         free(scene->textures[i].id);
     }
     for (int i = 0; i < scene->bsdf_count; ++i) {
@@ -449,10 +452,25 @@ static bool build_embree(tr_scene *scene, int threads, tr_log *log)
 
 /* ---- >>finish ----------------------------------------------------------------------------------------------- */
 
+/* Compact forms of bitmaps; what has none is looked up in its floats. */
+static void compact_textures(tr_scene *scene)
+{
+    for (int i = 0; i < scene->texture_count; ++i) {
+        tr_texture *t = &scene->textures[i];
+        if (t->type != TR_TEXTURE_BITMAP || t->texels)
+            continue;
+        int j = 0;
+        while (scene->textures[j].image.data != t->image.data)
+            ++j;
+        t->texels = j < i ? scene->textures[j].texels : tr_texels_make(&t->image);
+    }
+}
+
 static bool finish(tr_scene *scene, int threads, tr_log *log)
 {
     if (!check_scene(scene, log))
         return false;
+    compact_textures(scene);
     for (int i = 0; i < scene->bsdf_count; ++i)
         if (!tr_bsdf_finish(scene, &scene->bsdfs[i], log))
             return false;

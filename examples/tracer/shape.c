@@ -513,7 +513,7 @@ static void mesh_tangents(const tr_shape *s, tr_surface *out)
     out->dpdv = f.t;
 }
 
-static void mesh_surface(const tr_shape *s, uint32_t t, float b1, float b2, tr_surface *out)
+static inline void mesh_surface(const tr_shape *s, uint32_t t, float b1, float b2, tr_surface *out)
 {
     const uint32_t *id = s->indices + 3 * (size_t)t;
     vec3 p0 = vertex(s, t, 0), e1 = sub3(vertex(s, t, 1), p0), e2 = sub3(vertex(s, t, 2), p0);
@@ -593,12 +593,6 @@ static void analytic_surface(const tr_shape *s, const struct RTCRay *ray, tr_sur
     }
 }
 
-#if defined(__GNUC__)
-#define PREFETCH(p) __builtin_prefetch(p)
-#else
-#define PREFETCH(p) ((void)(p))
-#endif
-
 void tr_surface_prefetch(const tr_scene *scene, const struct RTCRayHit *hit, int stage)
 {
     if (hit->hit.geomID == RTC_INVALID_GEOMETRY_ID)
@@ -606,17 +600,19 @@ void tr_surface_prefetch(const tr_scene *scene, const struct RTCRayHit *hit, int
     const tr_shape *s = &scene->shapes[hit->hit.geomID];
     if (s->type != TR_SHAPE_MESH)
         return;
+    if (s->triangle_count < 64) /* walls and the like stay in the cache */
+        return;
     const uint32_t *id = s->indices + 3 * (size_t)hit->hit.primID;
     if (stage == 0) {
-        PREFETCH(id);
+        TR_PREFETCH(id);
         return;
     }
     for (int i = 0; i < 3; ++i) {
-        PREFETCH(s->positions + 3 * (size_t)id[i]);
+        TR_PREFETCH(s->positions + 3 * (size_t)id[i]);
         if (s->uvs)
-            PREFETCH(s->uvs + 2 * (size_t)id[i]);
+            TR_PREFETCH(s->uvs + 2 * (size_t)id[i]);
         if (s->normals)
-            PREFETCH(s->normals + 3 * (size_t)id[i]);
+            TR_PREFETCH(s->normals + 3 * (size_t)id[i]);
     }
 }
 

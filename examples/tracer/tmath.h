@@ -118,7 +118,17 @@ static inline uint32_t rng_u32(tr_rng *r)
     return (xs >> rot) | (xs << ((32 - rot) & 31));
 }
 /* Uniform in [0, 1), 24 bits. */
-static inline float rng_float(tr_rng *r) { return (float)(rng_u32(r) >> 8) * 0x1p-24f; }
+static inline float rng_float(tr_rng *r) { return (float)(int32_t)(rng_u32(r) >> 8) * 0x1p-24f; }
+/* Two at once from one step, through a permutation of all 64 bits (RXS-M-XS of the same paper). */
+static inline void rng_float2(tr_rng *r, float *a, float *b)
+{
+    uint64_t old = r->state;
+    r->state = old * UINT64_C(6364136223846793005) + r->inc;
+    uint64_t word = ((old >> ((old >> 59) + 5)) ^ old) * UINT64_C(12605985483714917081);
+    word ^= word >> 43;
+    *a = (float)(int32_t)(word >> 40) * 0x1p-24f;
+    *b = (float)(int32_t)((uint32_t)word >> 8) * 0x1p-24f;
+}
 static inline tr_rng rng_seed(uint64_t seed, uint64_t stream)
 {
     tr_rng r;

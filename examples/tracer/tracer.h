@@ -15,6 +15,15 @@
 #include "embree.h"
 #include "tmath.h"
 
+#if defined(__GNUC__)
+#define TR_PREFETCH(p) __builtin_prefetch(p)
+/* For what is rare within a hot function: inlined it would cost the rest its registers. */
+#define TR_NOINLINE __attribute__((noinline))
+#else
+#define TR_PREFETCH(p) ((void)(p))
+#define TR_NOINLINE
+#endif
+
 /* ---- >>log -------------------------------------------------------------------------------------------------- */
 
 typedef enum tr_level { TR_NOTE, TR_WARNING, TR_ERROR } tr_level;
@@ -47,6 +56,9 @@ typedef struct tr_layer {
     bool full_float; /* write 32-bit float instead of half (cell ids need it) */
 } tr_layer;
 
+/* Zeroed memory in large pages where the system has them: for what is read here and there, where each small page costs
+   a walk through the page tables. Aligned to 64; free() frees it; NULL = none. */
+void *tr_alloc_pages(size_t size);
 bool tr_image_alloc(tr_image *image, int width, int height,
                     int channels); /* zeroed; false = out of memory or bad size */
 void tr_image_free(tr_image *image);
@@ -77,14 +89,28 @@ typedef enum tr_wrap { TR_WRAP_REPEAT, TR_WRAP_CLAMP, TR_WRAP_MIRROR } tr_wrap;
 typedef struct tr_texture {
     tr_texture_type type;
     char *id;
-    float uv[2][3];      /* u' = uv[0] . (u, v, 1), v' = uv[1] . (u, v, 1) */
-    vec3 color0, color1; /* checkerboard: color0 where floor(2u') + floor(2v') is even */
-    tr_image image;      /* bitmap: linear RGB (3 channels); row 0 of the image is v = 1 */
+    float uv[2][3];           /* u' = uv[0] . (u, v, 1), v' = uv[1] . (u, v, 1) */
+    vec3 color0, color1;      /* checkerboard: color0 where floor(2u') + floor(2v') is even */
+    tr_image image;           /* bitmap: linear RGB (3 channels); row 0 of the image is v = 1 */
+    struct tr_texels *texels; /* the image once more, smaller, or NULL; textures that share pixels share it */
     tr_wrap wrap;
     bool nearest; /* else bilinear */
 } tr_texture;
 
+/* A picture of at most 256 different values, as those of 8-bit files have: codes into a palette. Blocks of 4 x 4 texels
+   fill a cache line, since lookups are scattered and wait for memory more than for anything else. */
+typedef struct tr_texels {
+    float palette[256];
+    uint8_t (*code)[4]; /* [ceil(height / 4)][ceil(width / 4)][4][4] of red, green, blue and nothing */
+    size_t block_row;   /* texels in a row of blocks */
+} tr_texels;
+/* The compact form of an RGB image, NULL where there is none or no memory for it. */
+tr_texels *tr_texels_make(const tr_image *image);
+void tr_texels_free(tr_texels *texels);
+
 vec3 tr_texture_eval(const tr_texture *texture, float u, float v);
+/* Ask the cache for the texels that tr_texture_eval will read. */
+void tr_texture_prefetch(const tr_texture *texture, float u, float v);
 /* Derivative of the mean of channels to u and v, for bump maps. */
 void tr_texture_gradient(const tr_texture *texture, float u, float v, float *du, float *dv);
 
@@ -329,6 +355,8 @@ typedef struct tr_closure {
 
 /* wo in world space. False where nothing scatters (black, or seen from behind a one-sided bsdf). */
 bool tr_closure_prepare(const tr_scene *scene, const tr_surface *surface, vec3 wo, tr_closure *closure);
+/* Ask the cache for what tr_closure_prepare will read first. */
+void tr_closure_prefetch(const tr_scene *scene, const tr_surface *surface);
 /* Smooth part: f (1/sr, without cosine) and, where pdf is not NULL, its sampling density. wi in world space.
    The cosine to use with f is |dot(closure->frame.n, wi)|. Zero outside its support. */
 vec3 tr_closure_eval(const tr_closure *closure, vec3 wi, float *pdf);
