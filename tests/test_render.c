@@ -270,6 +270,9 @@ static void estimators_agree(const char *scene_name, const char *define, const c
 static void estimators_agree_on_cornell(void **state) { (void)state, estimators_agree("cornell", NULL, NULL, 64); }
 static void estimators_agree_on_hall(void **state) { (void)state, estimators_agree("hall", NULL, NULL, 64); }
 static void estimators_agree_on_gloss(void **state) { (void)state, estimators_agree("gloss", NULL, NULL, 128); }
+static void estimators_agree_on_ajar(void **state) { (void)state, estimators_agree("ajar", "gap", "120", 64); }
+static void estimators_agree_on_egg(void **state) { (void)state, estimators_agree("egg", "bulb", "0.11", 64); }
+static void estimators_agree_on_torus(void **state) { (void)state, estimators_agree("torus", "light_size", "1", 64); }
 
 /* ---- >>guided ----------------------------------------------------------------------------------------------- */
 
@@ -290,6 +293,9 @@ static void guided_agrees(const char *scene_name, const char *define, const char
 
 static void guided_agrees_on_cornell(void **state) { (void)state, guided_agrees("cornell", NULL, NULL, 127, false); }
 static void guided_agrees_on_gloss(void **state) { (void)state, guided_agrees("gloss", "bulb", "0.3", 127, true); }
+
+static void guided_agrees_on_ajar(void **state) { (void)state, guided_agrees("ajar", "gap", "120", 127, true); }
+static void guided_agrees_on_torus(void **state) { (void)state, guided_agrees("torus", "light_size", "1", 127, true); }
 
 /* ---- >>identical -------------------------------------------------------------------------------------------- */
 
@@ -366,8 +372,13 @@ int main(void)
         cmocka_unit_test(estimators_agree_on_cornell),
         cmocka_unit_test(estimators_agree_on_hall),
         cmocka_unit_test(estimators_agree_on_gloss),
+        cmocka_unit_test(estimators_agree_on_ajar),
+        cmocka_unit_test(estimators_agree_on_egg),
+        cmocka_unit_test(estimators_agree_on_torus),
         cmocka_unit_test(guided_agrees_on_cornell),
         cmocka_unit_test(guided_agrees_on_gloss),
+        cmocka_unit_test(guided_agrees_on_ajar),
+        cmocka_unit_test(guided_agrees_on_torus),
         cmocka_unit_test(pt_is_identical_for_any_threads),
         cmocka_unit_test(sdtree_is_identical_for_any_threads),
         cmocka_unit_test(closed_gate_changes_no_bit),
