@@ -239,7 +239,7 @@ lint:
 	@[ -n "$(CLANG_FORMAT)" ] || { echo 'lint: needs clang-format 14' >&2; exit 1; }
 	@$(CLANG_FORMAT) --dry-run -Werror --ferror-limit=1 $(SOURCES)
 	@for s in $(SCRIPTS); do bash -n $$s || exit 1; done
-	@! grep -nE '[[:space:]]+$$' $(SOURCES) $(SCRIPTS) Makefile $(wildcard *.md examples/scenes/*) || \
+	@! grep -nE '[[:space:]]+$$' $(SOURCES) $(SCRIPTS) Makefile $(wildcard *.md examples/scenes/*.*) || \
 		{ echo 'lint: white space at line ends' >&2; exit 1; }
 	@echo 'lint: clean'
 
