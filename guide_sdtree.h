@@ -21,9 +21,9 @@
                for (int i = 0; i < (1000 << pass); ++i) { // "trace": a lamp of radiance 100 around +x
                    float p[3] = {0.5f, 0.5f, 0.5f}, d[3];
                    float u[2] = {(float)(rand() & 0xffff) / 65536.0f, (float)(rand() & 0xffff) / 65536.0f};
-                   gsd_handle handle = gsd_find(&view, p, NULL);
+                   gsd_handle handle = gsd_find(&view, p, NULL, NULL);
                    float pdf = gsd_sample(&view, &handle, u, d), L = d[0] > 0.95f ? 100.0f : 1.0f;
-                   gsd_training_sample sample = gsd_make_scalar_sample(p, d, L, L, L, pdf, pdf, 0);
+                   gsd_training_sample sample = gsd_make_scalar_sample(p, d, NULL, L, L, L, pdf, pdf, 0);
                    gsd_record(stream, &sample, 1);
                }
                gsd_accumulate(field, &stream, 1, NULL, NULL);
@@ -130,7 +130,7 @@
 #include <stdint.h>
 #include <string.h>
 
-#define GSD_VERSION 1 /* of the saved format */
+#define GSD_VERSION 2 /* of the saved format */
 
 #ifndef GSD_API /* linkage of the functions; e.g. static */
 #define GSD_API extern
@@ -200,7 +200,8 @@ typedef enum gsd_simd { GSD_SIMD_AUTO, GSD_SIMD_SCALAR, GSD_SIMD_AVX2, GSD_SIMD_
 typedef struct gsd_desc {
     float bounds_min[3], bounds_max[3]; /* world-space box of the positions; made a cube and 0.1 % larger */
     gsd_target target;
-    uint32_t switch_pass; /* switching: first variance-aware pass, 1 .. 1000; default 4 (passes 0..3 have 15 spp) */
+    float switch_after;   /* switching: variance-aware once this many times the first pass's samples were seen,
+                             0.001 .. 1e6; default 4 */
     float split_samples;  /* c, samples a cell holds before it splits, 16 .. 1e9; default 1000 */
     float rho;            /* share of a quadtree's mass above which a node is divided, 1e-5 .. 1; default 0.01 */
     uint32_t max_depth;   /* of quadtrees, 1 .. 20; default 16 */
@@ -214,8 +215,9 @@ typedef struct gsd_desc {
     float uniform; /* e, share of uniform sampling in the guide's density, 1e-4 .. 1; default 0.01 */
     bool no_gate;  /* guide in every cell */
     bool no_guide_weight;  /* second-moment targets: w = 1 */
-    bool no_history;       /* clear the sums in every refine. Otherwise a cell whose pass brought less than 1.5 times
-                              the samples it held keeps half of its sums: passes of equal size then add up */
+    bool no_history;       /* clear the sums in every refine; see HOW IT WORKS */
+    float smoothing;       /* samples that say "even": the children's shares of a quadtree node with n non-zero samples
+                              are (n share + smoothing / 4) / (n + smoothing), 0.001 .. 1000; default 3 */
     bool alias;            /* build alias tables: sampling in constant time, but not monotone in u; + 12 bytes a leaf */
     float gate_margin;     /* V(1) / V(a) - 1 below which guiding does not pay, 0.001 .. 10; default 0.05 */
     float gate_gain;       /* V(1) - V(a) below which guiding does not pay, 0.0001 .. 1000; default 0.25 */
@@ -227,10 +229,11 @@ typedef struct gsd_desc {
     void *user;
 } gsd_desc;
 
-/* What is learned from one path vertex. 48 bytes. See THE SAMPLE; pdfs in 1/sr, L in W/m^2/sr. */
+/* What is learned from one path vertex. 44 bytes. See THE SAMPLE; pdfs in 1/sr, L in W/m^2/sr. Filled by
+   gsd_make_sample. */
 typedef struct gsd_training_sample {
     float position[3];
-    float direction[3];       /* unit */
+    uint32_t direction[2];    /* with the normal; see gsd_pack_direction */
     float radiance;           /* mean over channels of L; GSD_REJECTED */
     float contribution;       /* mean over channels of f L cos */
     float pixel_contribution; /* mean over channels of f L cos * throughput before this vertex / pixel estimate; not
@@ -243,8 +246,6 @@ typedef struct gsd_training_sample {
 
 /* Optional facts about the pass that refine ends. */
 typedef struct gsd_pass {
-    uint32_t
-        spp; /* samples per pixel of the pass: k = log2(spp / spp of the first pass); 0 = k from recorded samples */
     bool pixel_estimate; /* the pass's pixel_contributions were relative to a pixel estimate: see Gate */
 } gsd_pass;
 
@@ -311,7 +312,7 @@ typedef struct gsd_alias {
     uint32_t node, other;
 } gsd_alias;
 
-/* 36 bytes: what a query knows about a cell. */
+/* 40 bytes: what a query knows about a cell. */
 typedef struct gsd_cell {
     uint32_t root;        /* node of its quadtree; 0 = uniform */
     uint32_t jump;        /* into the table of jumps; 0 = none */
@@ -322,6 +323,7 @@ typedef struct gsd_cell {
     uint32_t level;  /* in the spatial tree */
     uint32_t gate;   /* GSD_GATE_... */
     float reflected; /* see gsd_handle */
+    uint32_t depth;  /* of the deepest leaf of its quadtree */
 } gsd_cell;
 enum { GSD_GATE_UNJUDGED, GSD_GATE_OPEN, GSD_GATE_CLOSED };
 
@@ -331,7 +333,9 @@ typedef struct gsd_view {
     const uint32_t *spatial; /* link of each node: GSD_CELL_BIT + cell, or index of the first of two children */
     const gsd_cell *cells;
     const gsd_node *nodes; /* nodes[0] is the uniform leaf */
-    const uint32_t *jumps; /* [8][8] per table: node at depth 3 or the leaf above */
+    const uint32_t *jumps; /* [8][8] per table: node at depth 3 or the leaf above; one table per quadtree */
+    const float *masses;   /* [8][8] per table: learned probability of that bin of directions */
+    const float *bins;     /* [3][64]: x, y, z of the mean of a bin's directions */
     const gsd_alias *aliases;
     float origin[3], scale; /* grid coordinate (24 bits an axis) = (position - origin) * scale */
     float uniform;
@@ -340,12 +344,14 @@ typedef struct gsd_view {
 } gsd_view;
 #define GSD_CELL_BIT 0x80000000u
 
-/* What find gives: plain data, 28 bytes, valid as long as the view. */
+/* What find gives: plain data, 44 bytes, valid as long as the view. */
 typedef struct gsd_handle {
     uint32_t cell, root, jump, alias, alias_count;
     float alpha;     /* probability of BSDF sampling; 1 = do not guide */
     float reflected; /* mean of contribution / pdf_mix in the cell: the radiance that its surfaces reflect, W/m^2/sr; 0
                         = not known. What a path can still bring here, for Russian roulette [Vorba 2016] */
+    float normal[3];
+    float product; /* > 0: the density is multiplied by the cosine to this normal; 1 / (mean cosine) */
 } gsd_handle;
 
 /* ---- >>field ------------------------------------------------------------------------------------------------ */
@@ -520,7 +526,7 @@ GSD_QUERY uint32_t gsd_leaf_at(const gsd_view *view, const gsd_handle *handle, u
 /* The cell as a handle. cell < view->cell_count; larger ones give the uniform density. For forests. [any thread] */
 GSD_QUERY gsd_handle gsd_find_cell(const gsd_view *view, uint32_t cell)
 {
-    gsd_handle handle = {0, 0, 0, 0, 0, 1.0f, 0};
+    gsd_handle handle = {0, 0, 0, 0, 0, 1.0f, 0, {0, 0, 0}, 0};
     if (cell < view->cell_count) {
         const gsd_cell *c = &view->cells[cell];
         handle.cell = cell;
@@ -562,10 +568,45 @@ GSD_QUERY uint32_t gsd_cell_at(const gsd_view *view, const uint32_t g[3])
 /* Extent along an axis of a cell at this level of the spatial tree, in grid units. */
 GSD_QUERY uint32_t gsd_cell_extent(uint32_t level, uint32_t axis) { return 16777216u >> ((level + 2 - axis) / 3); }
 
-/* Find the cell of a position. u = three random numbers in [0,1) jitter the position by the size of its cell, which
-   blends neighbours (unbiased: sample and pdf speak of the handle's cell); NULL = the cell it lies in. [any thread] */
-GSD_QUERY gsd_handle gsd_find(const gsd_view *view, const float position[3], const float *u)
+/* Cosine that bin k of the 8 x 8 bins of directions counts with for a surface normal: the cosine t to the mean of the
+   bin's directions, softened near the horizon, which cuts through bins, and at least GSD_BELOW, so that no light is
+   lost: GSD_BELOW + (0 | (t + h)^2 / 4h | t) for t (< -h | between | > h), h = GSD_HORIZON. */
+#define GSD_HORIZON 0.25f
+#define GSD_BELOW 0.02f
+GSD_QUERY float gsd_bin_cosine(const gsd_view *view, const float normal[3], uint32_t k)
 {
+    const float *b = view->bins + k;
+    float t = (normal[0] * b[0] + normal[1] * b[64]) + normal[2] * b[128], r = t + GSD_HORIZON, above = t - GSD_HORIZON;
+    r = r > 0 ? r : 0;
+    r = r < 2 * GSD_HORIZON ? r : 2 * GSD_HORIZON;
+    above = above > 0 ? above : 0;
+    return r * r * (0.25f / GSD_HORIZON) + (above + GSD_BELOW);
+}
+
+/* Multiply a handle's density by the cosine to a normal (unit, on the side that light comes from): gsd_find does it
+   itself, this is for gsd_find_cell. A zero normal, an untrained cell and one that does not guide (alpha = 1) are left
+   alone. [any thread] */
+GSD_QUERY void gsd_orient(const gsd_view *view, gsd_handle *handle, const float normal[3])
+{
+    const float *mass = view->masses + handle->jump;
+    float z[8] = {0, 0, 0, 0, 0, 0, 0, 0};
+    uint32_t k, i;
+    if (handle->jump == 0 || handle->alpha >= 1 || !(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2] > 0.5f))
+        return;
+    for (k = 0; k < 64; k += 8)
+        for (i = 0; i < 8; ++i)
+            z[i] += mass[k + i] * gsd_bin_cosine(view, normal, k + i);
+    memcpy(handle->normal, normal, sizeof handle->normal);
+    handle->product = 1 / (((z[0] + z[1]) + (z[2] + z[3])) + ((z[4] + z[5]) + (z[6] + z[7])));
+}
+
+/* Find the cell of a position. normal (unit, on the side that light comes from) makes the density follow the cosine
+   there; NULL or zero = no surface, or one that light passes. u = three random numbers in [0,1) jitter the position by
+   the size of its cell, which blends neighbours (unbiased: sample and pdf speak of the handle's cell); NULL = the cell
+   it lies in. [any thread] */
+GSD_QUERY gsd_handle gsd_find(const gsd_view *view, const float position[3], const float *normal, const float *u)
+{
+    gsd_handle handle;
     uint32_t g[3], cell, axis;
     for (axis = 0; axis < 3; ++axis)
         g[axis] = gsd_grid_coordinate(position[axis], view->origin[axis], view->scale);
@@ -578,7 +619,21 @@ GSD_QUERY gsd_handle gsd_find(const gsd_view *view, const float position[3], con
         }
         cell = gsd_cell_at(view, g);
     }
-    return gsd_find_cell(view, cell);
+    handle = gsd_find_cell(view, cell);
+    if (normal)
+        gsd_orient(view, &handle, normal);
+    return handle;
+}
+
+/* A leaf's density as this handle sees it: (1 - e) learned * cosine / mean cosine + e / (4 pi). x, y: a direction in
+   the leaf. */
+GSD_QUERY float gsd_oriented(const gsd_view *view, const gsd_handle *handle, float pdf, uint32_t x, uint32_t y)
+{
+    float even = view->uniform * GSD_INV_4PI;
+    if (!(handle->product > 0))
+        return pdf;
+    pdf = pdf > even ? pdf - even : 0;
+    return pdf * (gsd_bin_cosine(view, handle->normal, (y >> 21) * 8 + (x >> 21)) * handle->product) + even;
 }
 
 /* Density (1/sr) with which gsd_sample draws this direction (unit); > 0 everywhere. [any thread] */
@@ -586,7 +641,7 @@ GSD_QUERY float gsd_pdf(const gsd_view *view, const gsd_handle *handle, const fl
 {
     uint32_t x, y;
     gsd_coordinates(direction, &x, &y);
-    return view->nodes[gsd_leaf_at(view, handle, x, y)].leaf.pdf;
+    return gsd_oriented(view, handle, view->nodes[gsd_leaf_at(view, handle, x, y)].leaf.pdf, x, y);
 }
 
 /* Direction at (tx, ty) in [0, 1)^2 within a leaf, and the density of the rounded direction: the leaf's, unless the
@@ -595,16 +650,59 @@ GSD_QUERY float gsd_sample_leaf(const gsd_view *view, const gsd_handle *handle, 
                                 float direction[3])
 {
     const gsd_node *leaf = &view->nodes[node];
+    uint32_t left = leaf->leaf.x & 0xffffffu, low = leaf->leaf.y;
     double size = (double)(16777216u >> (leaf->leaf.x >> 24));
     double fx, fy;
     tx = tx > 0 ? tx : 0;
     ty = ty > 0 ? ty : 0;
     fx = (tx < 0.99999999988 ? tx : 0.99999999988) * size;
     fy = (ty < 0.99999999988 ? ty : 0.99999999988) * size;
-    gsd_direction((double)(leaf->leaf.x & 0xffffffu) + fx, (double)leaf->leaf.y + fy, direction);
-    if (fx < 2 || fx > size - 2 || fy < 2 || fy > size - 2)
+    gsd_direction((double)left + fx, (double)low + fy, direction);
+    if (fx < 2 || fx > size - 2 || fy < 2 || fy > size - 2 || (handle->product > 0 && size > 2097152))
         return gsd_pdf(view, handle, direction);
-    return leaf->leaf.pdf;
+    return gsd_oriented(view, handle, leaf->leaf.pdf, left, low);
+}
+
+/* First step of sampling a product: choose a row of bins by r[1], a bin in it by r[0], which become the place in the
+   node that the bin's jump leads to. row: sums of the rows' probabilities before normalisation. */
+GSD_QUERY uint32_t gsd_choose_bin(const gsd_view *view, const gsd_handle *handle, const float *weight, const float *row,
+                                  double r[2])
+{
+    double total = 0, t, w;
+    uint32_t x, y, node, depth, mask;
+    for (y = 0; y < 8; ++y)
+        total += (double)row[y];
+    t = r[1] * total;
+    for (y = 0; y < 7 && t >= (double)row[y]; ++y)
+        t -= (double)row[y];
+    r[1] = t / (double)row[y];
+    t = r[0] * (double)row[y];
+    for (x = 0; x < 7 && t >= (double)weight[y * 8 + x]; ++x)
+        t -= (double)weight[y * 8 + x];
+    w = (double)weight[y * 8 + x];
+    r[0] = w > 0 && t < w ? t / w : 0.99999999988;
+    r[1] = r[1] < 0.99999999988 ? r[1] : 0.99999999988;
+    node = view->jumps[handle->jump + y * 8 + x];
+    if (view->nodes[node].leaf.child == 0 && (depth = view->nodes[node].leaf.x >> 24) < 3) { /* the bin is a part */
+        double part = 1.0 / (double)(8u >> depth);
+        mask = (8u >> depth) - 1;
+        r[0] = ((double)(x & mask) + r[0]) * part;
+        r[1] = ((double)(y & mask) + r[1]) * part;
+    }
+    return node;
+}
+
+/* Probabilities of the bins under the product, and the sums of the 8 rows. */
+GSD_QUERY void gsd_bin_weights(const gsd_view *view, const gsd_handle *handle, float weight[64], float row[8])
+{
+    const float *mass = view->masses + handle->jump;
+    uint32_t k, y;
+    for (k = 0; k < 64; ++k)
+        weight[k] = mass[k] * gsd_bin_cosine(view, handle->normal, k);
+    for (y = 0; y < 8; ++y) {
+        const float *w = weight + y * 8;
+        row[y] = ((w[0] + w[1]) + (w[2] + w[3])) + ((w[4] + w[5]) + (w[6] + w[7]));
+    }
 }
 
 /* Draw a direction from the two random numbers u in [0, 1); returns its density (1/sr). Monotone in u along phi and z
@@ -620,7 +718,11 @@ GSD_QUERY float gsd_sample(const gsd_view *view, const gsd_handle *handle, const
     }
     r[0] = (r[0] - e) / (1 - e);
     r[0] = r[0] < 0.99999999988 ? r[0] : 0.99999999988;
-    if (handle->alias_count) {
+    if (handle->product > 0) {
+        float weight[64], row[8];
+        gsd_bin_weights(view, handle, weight, row);
+        node = gsd_choose_bin(view, handle, weight, row, r);
+    } else if (handle->alias_count) {
         double slot = r[0] * (double)handle->alias_count;
         const gsd_alias *a = &view->aliases[handle->alias + (uint32_t)slot];
         double rest = slot - floor(slot), t = (double)a->threshold;
@@ -645,28 +747,72 @@ GSD_QUERY float gsd_sample(const gsd_view *view, const gsd_handle *handle, const
     return gsd_sample_leaf(view, handle, node, r[0], r[1], direction);
 }
 
-/* A training sample from scalars (channel means). [any thread] */
-GSD_QUERY gsd_training_sample gsd_make_scalar_sample(const float position[3], const float direction[3], float radiance,
-                                                     float contribution, float pixel_contribution, float pdf_mix,
-                                                     float pdf_bsdf, float pdf_guide)
+/* Direction as the field keeps it: coordinates in the lower 24 bits of both words; above them the normal as 8 + 8 bits
+   of an octahedral map, 0 = none. False where the direction is not finite or zero. [any thread] */
+GSD_QUERY bool gsd_pack_direction(const float direction[3], const float *normal, uint32_t packed[2])
+{
+    float l = direction[0] * direction[0] + direction[1] * direction[1] + direction[2] * direction[2], d[3], n, a, b;
+    bool valid = l > 1e-12f && l < 1e12f;
+    l = fabsf(l - 1) < 1e-4f || !valid ? 1 : 1 / sqrtf(l);
+    d[0] = direction[0] * l;
+    d[1] = direction[1] * l;
+    d[2] = direction[2] * l;
+    gsd_coordinates(d, &packed[0], &packed[1]);
+    n = normal ? fabsf(normal[0]) + fabsf(normal[1]) + fabsf(normal[2]) : 0;
+    if (!(n > 0.5f && n < 4))
+        return valid;
+    a = normal[0] / n;
+    b = normal[1] / n;
+    if (normal[2] < 0) {
+        float t = (1 - fabsf(b)) * (a < 0 ? -1.0f : 1.0f);
+        b = (1 - fabsf(a)) * (b < 0 ? -1.0f : 1.0f);
+        a = t;
+    }
+    packed[0] |= (uint32_t)(128.5f + 127 * a) << 24;
+    packed[1] |= (uint32_t)(128.5f + 127 * b) << 24;
+    return valid;
+}
+
+/* The normal of a packed direction; zero where it has none. [any thread] */
+GSD_QUERY void gsd_unpack_normal(const uint32_t packed[2], float normal[3])
+{
+    float a = ((float)(packed[0] >> 24) - 128) / 127, b = ((float)(packed[1] >> 24) - 128) / 127;
+    float c = 1 - fabsf(a) - fabsf(b), t = c < 0 ? c : 0, l;
+    normal[0] = normal[1] = normal[2] = 0;
+    if (packed[0] >> 24 == 0)
+        return;
+    a += a < 0 ? -t : t;
+    b += b < 0 ? -t : t;
+    l = 1 / sqrtf(a * a + b * b + c * c);
+    normal[0] = a * l;
+    normal[1] = b * l;
+    normal[2] = c * l;
+}
+
+/* A training sample from scalars (channel means); normal: what gsd_find got, NULL = none. [any thread] */
+GSD_QUERY gsd_training_sample gsd_make_scalar_sample(const float position[3], const float direction[3],
+                                                     const float *normal, float radiance, float contribution,
+                                                     float pixel_contribution, float pdf_mix, float pdf_bsdf,
+                                                     float pdf_guide)
 {
     gsd_training_sample s;
     memcpy(s.position, position, sizeof s.position);
-    memcpy(s.direction, direction, sizeof s.direction);
     s.radiance = radiance;
     s.contribution = contribution;
     s.pixel_contribution = pixel_contribution;
-    s.pdf_mix = pdf_mix;
+    s.pdf_mix = gsd_pack_direction(direction, normal, s.direction) ? pdf_mix : 0; /* 0: will be refused */
     s.pdf_bsdf = pdf_bsdf;
     s.pdf_guide = pdf_guide;
     return s;
 }
 
-/* A training sample from the renderer's RGB values: L incident radiance, f BSDF without the cosine, pixel_weight
-   throughput before this vertex / pixel estimate (NULL = 1; only the variance-aware target needs it). [any thread] */
-GSD_QUERY gsd_training_sample gsd_make_sample(const float position[3], const float direction[3], const float L[3],
-                                              const float f[3], float cosine, const float pixel_weight[3],
-                                              float pdf_mix, float pdf_bsdf, float pdf_guide)
+/* A training sample from the renderer's RGB values: normal what gsd_find got (NULL = none), L incident radiance, f BSDF
+   without the cosine, pixel_weight throughput before this vertex / pixel estimate (NULL = 1; only the variance-aware
+   target needs it). [any thread] */
+GSD_QUERY gsd_training_sample gsd_make_sample(const float position[3], const float direction[3], const float *normal,
+                                              const float L[3], const float f[3], float cosine,
+                                              const float pixel_weight[3], float pdf_mix, float pdf_bsdf,
+                                              float pdf_guide)
 {
     float radiance = 0, contribution = 0, pixel = 0;
     int c;
@@ -676,16 +822,18 @@ GSD_QUERY gsd_training_sample gsd_make_sample(const float position[3], const flo
         contribution += v;
         pixel += pixel_weight ? v * pixel_weight[c] : v;
     }
-    return gsd_make_scalar_sample(position, direction, radiance, contribution, pixel, pdf_mix, pdf_bsdf, pdf_guide);
+    return gsd_make_scalar_sample(position, direction, normal, radiance, contribution, pixel, pdf_mix, pdf_bsdf,
+                                  pdf_guide);
 }
 
 /* ---- >>batch ------------------------------------------------------------------------------------------------ */
 
 /* The queries for arrays: several in flight at once, so that memory latency overlaps. index lists the entries to
-   process in all arrays (NULL = 0 .. count - 1); strides are in bytes. u of find may be NULL, alpha (dense floats) of
-   find may be NULL. Handles are dense. [any thread] */
+   process in all arrays (NULL = 0 .. count - 1); strides are in bytes. normals, u and alpha (dense floats) of find may
+   be NULL. Handles are dense. [any thread] */
 GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const float *positions,
-                            size_t position_stride, const float *u, size_t u_stride, gsd_handle *handles, float *alpha);
+                            size_t position_stride, const float *normals, size_t normal_stride, const float *u,
+                            size_t u_stride, gsd_handle *handles, float *alpha);
 GSD_API void gsd_sample_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const gsd_handle *handles,
                               const float *u, size_t u_stride, float *directions, size_t direction_stride, float *pdf);
 GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const gsd_handle *handles,
@@ -737,7 +885,7 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 
 #define GSDI_NONE 0xffffffffu
 #define GSDI_GRID 4096u       /* 16^3 links */
-#define GSDI_JUMP_NODES 64u   /* a tree of more nodes than this has a jump table */
+#define GSDI_BINS 64u         /* 8 x 8 bins of directions: nodes of depth 3 */
 #define GSDI_ROUND (1u << 18) /* samples sorted at once */
 #define GSDI_SEGMENT 2048u    /* samples prepared at once */
 #define GSDI_STACK 96         /* of a walk through a quadtree: 3 * depth 20 + 4 is the most */
@@ -753,7 +901,6 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_ENOUGH_HITS 256u     /* non-zero samples of a cell and pass; from then on the gate takes one of eight */
 #define GSDI_REFLECTED_SAMPLES 32 /* of a cell and pass, for its mean reflected radiance to count */
 #define GSDI_MIN_REBUILDS 3       /* before that verdict: the first trees are noise */
-#define GSDI_HISTORY 0.5          /* share of the sums kept where passes do not grow */
 #define GSDI_MAX_CELLS (1u << 26)
 
 /* ---- >>memory ----------------------------------------------------------------------------------------------- */
@@ -802,6 +949,7 @@ static void gsdi_run(gsd_parallel_fn parallel, void *user, uint32_t count, uint3
 /* What building knows about a cell; saved as it is, so no padding. Sums are f64. */
 typedef struct gsdi_state {
     double held;                   /* samples in the sums, those kept from earlier passes included */
+    double lit;                    /* of which non-zero */
     double fresh;                  /* of this pass */
     double gate_count;             /* samples that the gate has seen */
     double v[GSDI_GATE_LOW + 1];   /* sum of x_a = contribution^2 / (p p_a); the last is a = 1 */
@@ -839,7 +987,7 @@ typedef struct gsdi_tree {
 typedef struct gsdi_block {
     uint64_t size;
     uint32_t spatial, cells, trees, nodes, jumps, aliases; /* counts */
-    uint64_t grid_at, spatial_at, cells_at, trees_at, nodes_at, jumps_at, aliases_at;
+    uint64_t grid_at, spatial_at, cells_at, trees_at, nodes_at, jumps_at, masses_at, bins_at, aliases_at;
     float origin[3], scale;
     float uniform;
     uint32_t roots; /* nodes before the first group */
@@ -857,8 +1005,10 @@ struct gsd_field {
     uint32_t building_nodes;
     uint32_t passes;
     double first_pass_samples, last_pass_samples;
-    uint32_t first_pass_spp;
-    uint32_t pixels; /* the last pass had a pixel estimate */
+    double all_samples;  /* recorded for this target so far */
+    double held_samples; /* of which refine kept that many */
+    uint32_t target;     /* gsd_target that is learned now: never switching */
+    uint32_t pixels;     /* the last pass had a pixel estimate */
     uint64_t structure;
     gsd_stats stats;
     uint32_t guiding; /* cells with alpha < 1 */
@@ -1187,13 +1337,14 @@ static uint32_t gsdi_refine_tree(const uint32_t *child, const double *sum, const
 
 /* ---- >>accumulate ------------------------------------------------------------------------------------------- */
 
-/* What accumulate keeps of a sample while it sorts. 32 bytes. */
+/* What accumulate keeps of a sample while it sorts. 36 bytes. */
 typedef struct gsdi_item {
     uint32_t x;  /* 24-bit coordinate; bits 24 .. 29: index into gsdi_state.bins */
-    uint32_t y;  /* 24-bit coordinate; bit 24: rejected before tracing */
+    uint32_t y;  /* 24-bit coordinate */
     float value; /* radiance, contribution or pixel contribution, as the target asks */
     float contribution, pdf_mix, pdf_bsdf, pdf_guide;
-    float pixel; /* pixel contribution; then the weight that goes into the quadtree */
+    float pixel;     /* pixel contribution; then the weight that goes into the quadtree */
+    uint32_t normal; /* as packed: 8 + 8 bits */
 } gsdi_item;
 
 typedef struct gsdi_segment {
@@ -1218,20 +1369,10 @@ typedef struct gsdi_accumulation {
     uint32_t *busy;        /* [cells] cells with samples */
 } gsdi_accumulation;
 
-/* The target that pass `pass` learns. */
-static gsd_target gsdi_pass_target(const gsd_desc *desc, uint32_t pass)
-{
-    if (desc->target == GSD_TARGET_SWITCHING)
-        return pass < desc->switch_pass ? GSD_TARGET_SIMPLE : GSD_TARGET_VARIANCE;
-    return desc->target;
-}
-
-/* False where a sample is bad: not finite, negative, out of range, no density or no direction. */
+/* False where a sample is bad: not finite, negative, out of range, no density. */
 static bool gsdi_sample_valid(const gsd_training_sample *s)
 {
-    float length =
-        s->direction[0] * s->direction[0] + s->direction[1] * s->direction[1] + s->direction[2] * s->direction[2];
-    return length > 1e-12f && length < 1e12f && s->radiance >= 0 && (double)s->radiance < GSDI_MAX_VALUE &&
+    return s->radiance >= 0 && (double)s->radiance < GSDI_MAX_VALUE &&
            s->contribution >= 0 && (double)s->contribution < GSDI_MAX_VALUE && s->pixel_contribution >= 0 &&
            (double)s->pixel_contribution < GSDI_MAX_VALUE && s->pdf_mix > 0 && gsdi_finite(s->pdf_mix) &&
            s->pdf_bsdf >= 0 && gsdi_finite(s->pdf_bsdf) && s->pdf_guide >= 0 && gsdi_finite(s->pdf_guide) &&
@@ -1289,20 +1430,14 @@ static void gsdi_prepare(void *context, uint32_t begin, uint32_t end)
             uint32_t at = segment->base + i;
             gsdi_item *item = &a->items[at];
             bool rejected = s->radiance == 0 && signbit(s->radiance);
-            float d[3], scale;
             if (!gsdi_sample_valid(s)) {
                 segment->refused++;
                 a->read_cell[at] = a->target_cell[at] = GSDI_NONE;
                 continue;
             }
-            scale = s->direction[0] * s->direction[0] + s->direction[1] * s->direction[1] +
-                    s->direction[2] * s->direction[2];
-            scale = fabsf(scale - 1) < 1e-4f ? 1 : 1 / sqrtf(scale);
-            d[0] = s->direction[0] * scale;
-            d[1] = s->direction[1] * scale;
-            d[2] = s->direction[2] * scale;
-            gsd_coordinates(d, &item->x, &item->y);
-            item->y |= rejected ? 1u << 24 : 0;
+            item->x = s->direction[0] & 0xffffffu;
+            item->y = s->direction[1] & 0xffffffu;
+            item->normal = s->direction[0] >> 24 | s->direction[1] >> 24 << 8;
             if (!gsdi_locate(a, s, at, item, segment)) {
                 segment->refused++;
                 a->read_cell[at] = a->target_cell[at] = GSDI_NONE;
@@ -1312,6 +1447,11 @@ static void gsdi_prepare(void *context, uint32_t begin, uint32_t end)
                           : a->target == GSD_TARGET_SIMPLE ? s->contribution
                                                            : s->pixel_contribution;
             item->value = rejected ? 0 : item->value;
+            if (a->second_moment && item->value > 0 && item->normal) { /* the cosine is multiplied in when sampling */
+                float normal[3];
+                gsd_unpack_normal(s->direction, normal);
+                item->value /= gsd_bin_cosine(&a->view, normal, (item->y >> 21) * 8 + (item->x >> 21 & 7u));
+            }
             item->contribution = rejected ? 0 : s->contribution;
             item->pixel = rejected ? 0 : s->pixel_contribution;
             item->pdf_mix = s->pdf_mix;
@@ -1369,11 +1509,24 @@ static void gsdi_gate_add(gsdi_state *state, double g, double pixel, double p, d
     state->pixel_v += x[GSDI_GATE_LOW];
 }
 
+/* The guide's density of an item whose vertex did not ask for it. */
+static double gsdi_item_pdf(const gsdi_accumulation *a, const gsd_handle *handle, const gsdi_item *item)
+{
+    gsd_handle oriented = *handle;
+    uint32_t x = item->x & 0xffffffu, y = item->y, packed[2];
+    float normal[3];
+    packed[0] = item->normal << 24;
+    packed[1] = item->normal >> 8 << 24;
+    gsd_unpack_normal(packed, normal);
+    oriented.alpha = 0;
+    gsd_orient(&a->view, &oriented, normal);
+    return (double)gsd_oriented(&a->view, &oriented, a->view.nodes[gsd_leaf_at(&a->view, handle, x, y)].leaf.pdf, x, y);
+}
+
 /* Learn from one item in the cell where it lies; sets the weight that goes into the quadtree. */
 static void gsdi_learn(const gsdi_accumulation *a, gsdi_state *state, const gsd_handle *handle, gsdi_item *item)
 {
     const gsd_desc *desc = &a->field->desc;
-    uint32_t x = item->x & 0xffffffu, y = item->y & 0xffffffu;
     double p = (double)item->pdf_mix, pb = (double)item->pdf_bsdf, pg = (double)item->pdf_guide;
     double c = (double)item->contribution, value = (double)item->value;
     bool judge = a->judge && (state->gate != GSD_GATE_CLOSED || state->probe == 0);
@@ -1384,7 +1537,7 @@ static void gsdi_learn(const gsdi_accumulation *a, gsdi_state *state, const gsd_
     judge = judge && (state->hits < GSDI_ENOUGH_HITS || ((uint32_t)(int64_t)state->fresh & 7u) == 0);
     state->gate_count += judge;
     if (((judge && c > 0) || weigh) && !(pg > 0))
-        pg = (double)a->view.nodes[gsd_leaf_at(&a->view, handle, x, y)].leaf.pdf;
+        pg = gsdi_item_pdf(a, handle, item);
     if (judge && c > 0) {
         state->hits++;
         gsdi_gate_add(state, c, (double)item->pixel, p, pb, handle->root ? pg : pb); /* without a tree: neutral */
@@ -1409,7 +1562,7 @@ static void gsdi_splat(const gsdi_accumulation *a, uint32_t cell, const gsdi_ite
     const gsdi_state *state = &a->field->states[cell];
     const uint32_t *child = a->field->child + state->first;
     double *sum = a->field->sum + state->first;
-    uint32_t x = item->x & 0xffffffu, y = item->y & 0xffffffu, depth;
+    uint32_t x = item->x & 0xffffffu, y = item->y, depth;
     if (!(item->pixel > 0))
         return;
     if (a->box)
@@ -1434,6 +1587,7 @@ static void gsdi_learn_cells(void *context, uint32_t begin, uint32_t end)
             gsdi_learn(a, state, &handle, item);
             if (!a->stochastic) {
                 state->held += 1;
+                state->lit += item->pixel > 0;
                 gsdi_splat(a, cell, item);
             }
         }
@@ -1447,8 +1601,10 @@ static void gsdi_splat_cells(void *context, uint32_t begin, uint32_t end)
     uint32_t b, i;
     for (b = begin; b < end; ++b) {
         uint32_t cell = a->busy[b];
-        for (i = a->start[cell]; i < a->start[cell + 1]; ++i)
+        for (i = a->start[cell]; i < a->start[cell + 1]; ++i) {
+            a->field->states[cell].lit += a->items[a->order[i]].pixel > 0;
             gsdi_splat(a, cell, &a->items[a->order[i]]);
+        }
         a->field->states[cell].held += (double)(a->start[cell + 1] - a->start[cell]);
     }
 }
@@ -1506,7 +1662,7 @@ static bool gsdi_accumulation_start(gsdi_accumulation *a, gsd_field *field, uint
     memset(a, 0, sizeof *a);
     a->field = field;
     a->view = gsd_get_view(field);
-    a->target = gsdi_pass_target(desc, field->passes);
+    a->target = (gsd_target)field->target;
     a->second_moment = a->target != GSD_TARGET_RADIANCE;
     a->stochastic = desc->spatial_filter == GSD_SPATIAL_STOCHASTIC && !desc->forest_cells;
     a->box = desc->directional_filter == GSD_DIRECTIONAL_BOX;
@@ -1651,8 +1807,8 @@ static void gsdi_verdict(const gsd_desc *desc, bool pixels, gsdi_state *s, gsd_s
     }
 }
 
-/* Verdict on a cell after a pass; fades its sums. changed: pixels are true now and were not before, or the reverse. */
-static void gsdi_judge(const gsd_desc *desc, bool pixels, bool changed, gsdi_state *s, gsd_stats *stats)
+/* Verdict on a cell after a pass. changed: pixels are true now and were not before, or the reverse. */
+static void gsdi_judge(const gsd_desc *desc, bool pixels, bool changed, double fade, gsdi_state *s, gsd_stats *stats)
 {
     if (changed)
         s->pixel = s->pixel_v = 0;
@@ -1668,7 +1824,7 @@ static void gsdi_judge(const gsd_desc *desc, bool pixels, bool changed, gsdi_sta
         gsdi_verdict(desc, pixels, s, stats);
     if (s->gate == GSD_GATE_CLOSED)
         s->probe = desc->gate_probe - 1;
-    gsdi_gate_scale(s, 0.5);
+    gsdi_gate_scale(s, fade);
 }
 
 /* ---- >>block ------------------------------------------------------------------------------------------------ */
@@ -1681,6 +1837,7 @@ static const gsdi_tree *gsdi_trees(const gsdi_block *b)
 static gsd_cell *gsdi_cells(gsdi_block *b) { return (gsd_cell *)(void *)((char *)b + b->cells_at); }
 static gsd_node *gsdi_nodes(gsdi_block *b) { return (gsd_node *)(void *)((char *)b + b->nodes_at); }
 static uint32_t *gsdi_words(gsdi_block *b, uint64_t at) { return (uint32_t *)(void *)((char *)b + at); }
+static float *gsdi_floats(gsdi_block *b, uint64_t at) { return (float *)(void *)((char *)b + at); }
 
 /* Offsets and size from the counts. */
 static void gsdi_block_layout(gsdi_block *b)
@@ -1690,6 +1847,10 @@ static void gsdi_block_layout(gsdi_block *b)
     at += (uint64_t)b->nodes * sizeof(gsd_node);
     b->jumps_at = at = (at + 63) & ~(uint64_t)63;
     at += (uint64_t)b->jumps * 4;
+    b->masses_at = at;
+    at += (uint64_t)b->jumps * 4;
+    b->bins_at = at;
+    at += 3 * GSDI_BINS * 4;
     b->grid_at = at;
     at += GSDI_GRID * 4;
     b->trees_at = at;
@@ -1726,6 +1887,8 @@ GSD_API gsd_view gsd_get_view(const gsd_field *field)
     view.cells = gsdi_cells(b);
     view.nodes = gsdi_nodes(b);
     view.jumps = gsdi_words(b, b->jumps_at);
+    view.masses = gsdi_floats(b, b->masses_at);
+    view.bins = gsdi_floats(b, b->bins_at);
     view.aliases = (const gsd_alias *)(const void *)((const char *)b + b->aliases_at);
     memcpy(view.origin, b->origin, sizeof view.origin);
     view.scale = b->scale;
@@ -1760,7 +1923,7 @@ static void gsdi_tree_shape(const gsd_desc *desc, gsdi_tree *tree, uint32_t grou
 {
     tree->groups = groups;
     tree->leaves = 3 * groups + 1;
-    tree->jump = groups * 4 + 1 > GSDI_JUMP_NODES;
+    tree->jump = groups > 0;
     tree->alias = groups && desc->alias ? tree->leaves : 0;
 }
 
@@ -1777,20 +1940,35 @@ static bool gsdi_block_places(gsdi_tree *trees, uint32_t count, gsdi_block *shap
     for (t = 0; t < count; ++t) {
         trees[t].first = (uint32_t)nodes;
         nodes += (uint64_t)trees[t].groups * 4;
-        jumps += trees[t].jump ? 64 : 0;
-        trees[t].jump = trees[t].jump ? (uint32_t)jumps : 0; /* offset 0 means none, so tables start at 64 */
+        jumps += trees[t].jump ? GSDI_BINS : 0;
+        trees[t].jump = trees[t].jump ? (uint32_t)jumps : 0; /* offset 0 means none: the first table is left empty */
         if (trees[t].alias) {
             trees[t].alias = (uint32_t)aliases;
             aliases += trees[t].leaves;
         }
-        if (nodes > 0xfffffff0u || aliases > 0xfffffff0u)
+        if (nodes > 0xfffffff0u || aliases > 0xfffffff0u || jumps > 0xffffff00u)
             return false;
     }
     shape->trees = count;
     shape->nodes = (uint32_t)nodes;
-    shape->jumps = (uint32_t)jumps + 64;
+    shape->jumps = (uint32_t)jumps + GSDI_BINS;
     shape->aliases = (uint32_t)aliases;
     return true;
+}
+
+/* Means of the directions in each bin: with r(z) = sqrt(1 - z^2), the mean of r over z by its integral, of cos phi and
+   sin phi likewise. */
+static void gsdi_block_bins(gsdi_block *b)
+{
+    float *bins = gsdi_floats(b, b->bins_at);
+    uint32_t i;
+    for (i = 0; i < GSDI_BINS; ++i) {
+        double z0 = (i >> 3) * 0.25 - 1, z1 = z0 + 0.25, width = 0.78539816339744831, p = (i & 7u) * width, q = p + width;
+        double r = 2 * (z1 * sqrt(1 - z1 * z1) + asin(z1) - z0 * sqrt(1 - z0 * z0) - asin(z0));
+        bins[i] = (float)(r * (sin(q) - sin(p)) / width);
+        bins[i + GSDI_BINS] = (float)(r * (cos(p) - cos(q)) / width);
+        bins[i + 2 * GSDI_BINS] = (float)(0.5 * (z0 + z1));
+    }
 }
 
 /* Copies of the uniform leaf in the reserved nodes. */
@@ -1798,6 +1976,7 @@ static void gsdi_block_uniform(gsdi_block *b)
 {
     gsd_node *nodes = gsdi_nodes(b);
     uint32_t i;
+    gsdi_block_bins(b);
     for (i = 0; i < b->roots; ++i) {
         nodes[i].leaf.child = 0;
         nodes[i].leaf.pdf = GSD_INV_4PI;
@@ -1805,18 +1984,28 @@ static void gsdi_block_uniform(gsdi_block *b)
     }
 }
 
+/* Where bin i of a tree begins: its node of depth 3 or the leaf above, and the learned probability of the bin. */
+static uint32_t gsdi_tree_bin(const gsd_node *nodes, uint32_t root, uint32_t i, float *mass)
+{
+    uint32_t node = root, k;
+    *mass = 1;
+    for (k = 0; k < 3 && nodes[node].inner.child; ++k) {
+        uint32_t bx = (i >> (2 - k)) & 1u, by = (i >> (5 - k)) & 1u;
+        float sx = nodes[node].inner.split[0], sy = nodes[node].inner.split[1 + bx];
+        *mass *= (bx ? 1 - sx : sx) * (by ? 1 - sy : sy);
+        node = nodes[node].inner.child + bx + 2 * by;
+    }
+    for (; k < 3; ++k)
+        *mass *= 0.25f;
+    return node;
+}
+
 static void gsdi_tree_jumps(gsdi_block *b, const gsdi_tree *tree)
 {
-    const gsd_node *nodes = gsdi_nodes(b);
-    uint32_t *jumps = gsdi_words(b, b->jumps_at) + tree->jump, i, k;
-    if (!tree->jump)
-        return;
-    for (i = 0; i < 64; ++i) {
-        uint32_t node = tree->root;
-        for (k = 0; k < 3 && nodes[node].inner.child; ++k)
-            node = nodes[node].inner.child + ((i >> (2 - k)) & 1u) + 2 * ((i >> (5 - k)) & 1u);
-        jumps[i] = node;
-    }
+    uint32_t *jumps = gsdi_words(b, b->jumps_at) + tree->jump, i;
+    float *masses = gsdi_floats(b, b->masses_at) + tree->jump;
+    for (i = 0; tree->jump && i < GSDI_BINS; ++i)
+        jumps[i] = gsdi_tree_bin(gsdi_nodes(b), tree->root, i, &masses[i]);
 }
 
 /* Alias table [Walker 1977] over the leaves. The share of leaf l is its learned mass; slots are filled in node order
@@ -1863,8 +2052,10 @@ static void gsdi_tree_aliases(gsdi_block *b, const gsdi_tree *tree)
         }
 }
 
-/* Write a sampling tree from plain masses. child: relative, as in the building part. */
-static void gsdi_tree_write(gsdi_block *b, gsdi_tree *tree, const uint32_t *child, const double *mass)
+/* Write a sampling tree from plain masses. child: relative, as in the building part. Shares are taken of samples * mass
+   + even: see gsd_desc.smoothing. */
+static void gsdi_tree_write(gsdi_block *b, gsdi_tree *tree, const uint32_t *child, const double *mass, double samples,
+                            double even)
 {
     struct gsdi_open {
         uint32_t node, out, x, y, depth;
@@ -1882,8 +2073,7 @@ static void gsdi_tree_write(gsdi_block *b, gsdi_tree *tree, const uint32_t *chil
         struct gsdi_open o = stack[top--];
         gsd_node *out = &nodes[o.out];
         uint32_t c = child[o.node];
-        const double *m = mass + c;
-        double total, left, right;
+        double m[4], total, left, right;
         if (!c) {
             out->leaf.child = 0;
             out->leaf.pdf = (float)((1 - e) * o.pdf + e * 0.07957747154594766788);
@@ -1893,6 +2083,8 @@ static void gsdi_tree_write(gsdi_block *b, gsdi_tree *tree, const uint32_t *chil
             mean += (double)o.depth * o.pdf * 12.566370614359172 / pow(4, (double)o.depth);
             continue;
         }
+        for (k = 0; k < 4; ++k)
+            m[k] = samples * mass[c + k] + even;
         total = (m[0] + m[1]) + (m[2] + m[3]);
         left = m[0] + m[2];
         right = m[1] + m[3];
@@ -1964,7 +2156,10 @@ typedef struct gsdi_refinement {
     gsd_field *field;
     const gsd_desc *desc;
     bool second_moment, clear;
+    gsd_target target; /* of the next pass */
+    double all_samples, held_samples;
     double rho, keep, split;
+    double fade; /* of the gate's sums */
     gsdi_job *jobs;       /* [old cells] */
     double *mass;         /* [building nodes] */
     unsigned char *depth; /* [building nodes] */
@@ -2135,16 +2330,16 @@ static bool gsdi_split_cells(gsdi_refinement *r)
 /* Nodes and cells that fit under max_bytes, when the old and the new part, and scratch, exist together. */
 static uint64_t gsdi_node_limit(const gsdi_refinement *r, uint32_t cells)
 {
-    uint64_t per_cell = 2 * (sizeof(gsdi_state) + sizeof(gsd_cell) + sizeof(gsdi_tree)) + sizeof(gsdi_job) +
+    uint64_t per_cell = 2 * (sizeof(gsdi_state) + sizeof(gsd_cell) + sizeof(gsdi_tree) + 8 * GSDI_BINS) + sizeof(gsdi_job) +
                         sizeof(gsdi_place) + sizeof(gsdi_tree) + 6 * sizeof(uint32_t) + 64;
-    uint64_t per_node = 2 * (16 + 4 + (r->desc->alias ? 9 : 0)) + 2 * 12 + 9;
-    uint64_t fixed = 2 * (GSDI_GRID * 4 + 1024) + sizeof(gsd_field) + cells * per_cell;
+    uint64_t per_node = 2 * (16 + (r->desc->alias ? 9 : 0)) + 2 * 12 + 9;
+    uint64_t fixed = 2 * (GSDI_GRID * 4 + 2048) + sizeof(gsd_field) + cells * per_cell;
     return fixed < r->desc->max_bytes ? (r->desc->max_bytes - fixed) / per_node : 0;
 }
 
 static uint32_t gsdi_cell_limit(const gsd_desc *desc)
 {
-    uint64_t limit = desc->max_bytes / 4 / (2 * sizeof(gsdi_state) + 512);
+    uint64_t limit = desc->max_bytes / 4 / (2 * sizeof(gsdi_state) + 16 * GSDI_BINS + 512);
     return limit < GSDI_MAX_CELLS ? (uint32_t)limit : GSDI_MAX_CELLS;
 }
 
@@ -2204,7 +2399,8 @@ static void gsdi_write_trees(void *context, uint32_t begin, uint32_t end)
         const gsdi_job *job = &r->jobs[c];
         uint32_t t = gsdi_cells(old)[c].tree;
         if (job->rebuild)
-            gsdi_tree_write(r->block, &r->trees[job->tree], r->field->child + s->first, r->mass + s->first);
+            gsdi_tree_write(r->block, &r->trees[job->tree], r->field->child + s->first, r->mass + s->first,
+                            s->lit / job->limit_mass, 0.25 * (double)r->desc->smoothing);
         else if (job->copy)
             gsdi_tree_copy(r->block, &r->trees[job->tree], old, &gsdi_trees(old)[t]);
     }
@@ -2222,6 +2418,7 @@ static void gsdi_cell_write(gsdi_block *b, const gsdi_tree *trees, gsd_cell *cel
     cell->level = s->level;
     cell->gate = s->gate;
     cell->reflected = s->reflected;
+    cell->depth = t->max_depth;
     cell->alpha = t->groups == 0 || s->gate == GSD_GATE_CLOSED ? 1.0f : s->alpha;
 }
 
@@ -2257,6 +2454,7 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
                 gsdi_refine_tree(child, sum, r->mass + old->first, r->rho * job->limit_mass, r->desc->max_depth, keep,
                                  r->child + p->first, r->sum + p->first);
             s->held = old->held * keep;
+            s->lit = old->lit * keep;
             s->rebuilds = old->rebuilds < 1000000u ? old->rebuilds + 1 : old->rebuilds;
             for (k = 0; k < 64; ++k)
                 s->bins[k] = p->level == old->level ? (uint32_t)((double)old->bins[k] * r->keep) : 0;
@@ -2264,7 +2462,7 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
             gsdi_gate_scale(s, share);
         }
         if (r->clear) { /* another target: what waits is of no use */
-            s->held = 0;
+            s->held = s->lit = 0;
             memset(s->bins, 0, sizeof s->bins);
             for (k = 0; k < p->count; ++k)
                 r->sum[p->first + k] = 0;
@@ -2275,22 +2473,27 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
     }
 }
 
-/* Threshold of splitting c sqrt(2^k), 2^k = growth of the pass over the first; share of sums to keep. */
-static void gsdi_pass_scale(gsdi_refinement *r, const gsd_pass *pass, double samples)
+/* Threshold of splitting, target, shares of the sums and of the gate's to keep. Growth of the last pass predicts the
+   next one; half of all samples shall count in it. */
+static void gsdi_pass_scale(gsdi_refinement *r, double samples)
 {
     gsd_field *field = r->field;
-    double growth = 1;
-    if (pass && pass->spp && field->first_pass_spp)
-        growth = (double)pass->spp / (double)field->first_pass_spp;
-    else if (field->first_pass_samples > 0)
-        growth = samples / field->first_pass_samples;
-    r->split = (double)r->desc->split_samples * sqrt(growth > 1 ? growth : 1);
-    r->keep = !r->desc->no_history && field->last_pass_samples > 0 && samples < 1.5 * field->last_pass_samples
-                  ? GSDI_HISTORY
-                  : 0;
-    r->clear = gsdi_pass_target(r->desc, field->passes) != gsdi_pass_target(r->desc, field->passes + 1);
-    if (r->clear)
-        r->keep = 0;
+    double first = field->passes ? field->first_pass_samples : samples, growth = 1;
+    double all = field->all_samples + samples, held = field->held_samples + samples;
+    if (field->last_pass_samples > 0)
+        growth = samples / field->last_pass_samples;
+    growth = growth > 1 ? growth < 2 ? growth : 2 : 1;
+    r->fade = growth < 1.05 ? 0.95 : 1 / growth;
+    r->split = (double)r->desc->split_samples * sqrt(first > 0 && held > first ? held / first : 1);
+    r->keep = held > 0 ? 0.5 * (all - growth * samples) / held : 0;
+    r->keep = r->desc->no_history || r->keep < 0 ? 0 : r->keep < 1 ? r->keep : 1;
+    r->target = (gsd_target)field->target;
+    if (r->desc->target == GSD_TARGET_SWITCHING && all >= (double)r->desc->switch_after * first)
+        r->target = GSD_TARGET_VARIANCE;
+    r->clear = r->target != (gsd_target)field->target;
+    r->keep = r->clear ? 0 : r->keep;
+    r->all_samples = r->clear ? 0 : all;
+    r->held_samples = r->keep * held;
 }
 
 /* Everything that refine allocates after the structure is known. */
@@ -2379,7 +2582,7 @@ static void gsdi_judge_cells(gsdi_refinement *r, const gsd_pass *pass, double sa
         if (s->fresh >= GSDI_REFLECTED_SAMPLES)
             s->reflected = (float)(s->flow / s->fresh);
         if (s->fresh > 0)
-            gsdi_judge(r->desc, pixels, changed, s, &r->stats);
+            gsdi_judge(r->desc, pixels, changed, r->fade, s, &r->stats);
         closed += s->gate == GSD_GATE_CLOSED ? s->fresh : 0;
         alpha += s->gate == GSD_GATE_CLOSED ? s->fresh : s->fresh * (double)s->alpha;
     }
@@ -2391,7 +2594,7 @@ static void gsdi_judge_cells(gsdi_refinement *r, const gsd_pass *pass, double sa
 }
 
 /* Make the new parts the field's, free the old. */
-static void gsdi_refine_commit(gsdi_refinement *r, const gsd_pass *pass, uint32_t nodes, double samples)
+static void gsdi_refine_commit(gsdi_refinement *r, uint32_t nodes, double samples)
 {
     gsd_field *field = r->field;
     gsdi_block *old = field->block;
@@ -2412,11 +2615,12 @@ static void gsdi_refine_commit(gsdi_refinement *r, const gsd_pass *pass, uint32_
     field->sum = r->sum;
     field->building_nodes = field->node_capacity = nodes;
     field->state_capacity = r->cells;
-    if (field->passes == 0) {
+    if (field->passes == 0)
         field->first_pass_samples = samples;
-        field->first_pass_spp = pass ? pass->spp : 0;
-    }
     field->last_pass_samples = samples;
+    field->all_samples = r->all_samples;
+    field->held_samples = r->held_samples;
+    field->target = (uint32_t)r->target;
     field->passes++;
     field->stats = r->stats;
     gsdi_field_changed(field);
@@ -2437,10 +2641,10 @@ GSD_API gsd_result gsd_refine(gsd_field *field, const gsd_pass *pass, gsd_parall
     r.desc = &field->desc;
     r.stats = field->stats;
     r.stats.split_cells = r.stats.rebuilt_trees = r.stats.waiting_cells = r.stats.unread_cells = 0;
-    r.second_moment = gsdi_pass_target(r.desc, field->passes) != GSD_TARGET_RADIANCE;
+    r.second_moment = field->target != GSD_TARGET_RADIANCE;
     for (i = 0; i < field->block->cells; ++i)
         samples += field->states[i].fresh;
-    gsdi_pass_scale(&r, pass, samples);
+    gsdi_pass_scale(&r, samples);
     nodes = gsdi_refine_plan(&r, parallel, user);
     if (!nodes || !gsdi_refine_allocate(&r, nodes)) {
         gsdi_refinement_free(&r);
@@ -2454,7 +2658,7 @@ GSD_API gsd_result gsd_refine(gsd_field *field, const gsd_pass *pass, gsd_parall
     gsdi_run(parallel, user, field->block->cells, 16, gsdi_write_trees, &r);
     gsdi_run(parallel, user, r.cells, 16, gsdi_write_cells, &r);
     memcpy((char *)r.block + r.block->trees_at, r.trees, r.tree_count * sizeof(gsdi_tree));
-    gsdi_refine_commit(&r, pass, nodes, samples);
+    gsdi_refine_commit(&r, nodes, samples);
     return GSD_OK;
 }
 
@@ -2517,9 +2721,10 @@ GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
     d.spatial_filter = d.spatial_filter ? d.spatial_filter : GSD_SPATIAL_NEAREST;
     d.directional_filter = d.directional_filter ? d.directional_filter : GSD_DIRECTIONAL_BOX;
     d.alpha_mode = d.alpha_mode ? d.alpha_mode : GSD_ALPHA_GRID;
-    gsdi_default_u32(&d.switch_pass, 4);
+    gsdi_default_float(&d.switch_after, 4);
     gsdi_default_float(&d.split_samples, 1000);
     gsdi_default_float(&d.rho, 0.01f);
+    gsdi_default_float(&d.smoothing, 3);
     gsdi_default_u32(&d.max_depth, 16);
     gsdi_default_u32(&d.max_levels, 48);
     gsdi_default_u32(&d.min_samples, 64);
@@ -2536,7 +2741,8 @@ GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
     d.simd = gsdi_simd(d.simd);
     if (d.simd == GSD_SIMD_AUTO)
         return GSD_BAD_OPTION;
-    if (!gsdi_within(d.switch_pass, 1, 1000) || !gsdi_within((double)d.split_samples, 16, 1e9) ||
+    if (!gsdi_within((double)d.switch_after, 0.99e-3, 1e6) || !gsdi_within((double)d.smoothing, 0.99e-3, 1000) ||
+        !gsdi_within((double)d.split_samples, 16, 1e9) ||
         !gsdi_within((double)d.rho, 0.99e-5, 1) || !gsdi_within(d.max_depth, 1, 20) ||
         !gsdi_within(d.max_levels, 1, 60) || !gsdi_within((double)d.alpha, 0.0499, 1) ||
         !gsdi_within((double)d.uniform, 0.99e-4, 1) || !gsdi_within((double)d.gate_margin, 0.99e-3, 10) ||
@@ -2605,6 +2811,7 @@ GSD_API gsd_result gsd_create(const gsd_desc *desc, gsd_field **out)
     if (!field)
         return GSD_OUT_OF_MEMORY;
     field->desc = d;
+    field->target = d.target == GSD_TARGET_SWITCHING ? GSD_TARGET_SIMPLE : (uint32_t)d.target;
     cells = d.forest_cells ? d.forest_cells : 1;
     depth = gsdi_start_depth(&d);
     nodes = gsdi_start_nodes(depth);
@@ -2788,6 +2995,7 @@ GSD_API gsd_result gsd_forest_split(gsd_field *field, uint32_t parent, uint32_t 
     for (i = 0; i < s->count; ++i)
         field->sum[s->first + i] *= 0.5;
     s->held *= 0.5;
+    s->lit *= 0.5;
     s->fresh *= 0.5;
     s->flow *= 0.5;
     gsdi_gate_scale(s, 0.5);
@@ -2820,10 +3028,73 @@ static float *gsdi_row_out(float *base, size_t stride, uint32_t row)
     return (float *)(void *)((char *)base + stride * row);
 }
 
-GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const float *positions,
-                            size_t position_stride, const float *u, size_t u_stride, gsd_handle *handles, float *alpha)
+#if GSDI_X86
+#define GSDI_AVX2 __attribute__((target("avx2")))
+
+/* A row of eight bins: gsd_bin_cosine times mass, in the same operations. */
+GSDI_AVX2 static __m256 gsdi_bin_row_avx2(const gsd_view *view, const __m256 normal[3], const float *mass, uint32_t k)
 {
-    uint32_t start, i, axis;
+    __m256 h = _mm256_set1_ps(GSD_HORIZON), zero = _mm256_setzero_ps(), t, r, above;
+    t = _mm256_add_ps(_mm256_mul_ps(normal[0], _mm256_loadu_ps(view->bins + k)),
+                      _mm256_mul_ps(normal[1], _mm256_loadu_ps(view->bins + GSDI_BINS + k)));
+    t = _mm256_add_ps(t, _mm256_mul_ps(normal[2], _mm256_loadu_ps(view->bins + 2 * GSDI_BINS + k)));
+    r = _mm256_min_ps(_mm256_max_ps(_mm256_add_ps(t, h), zero), _mm256_set1_ps(2 * GSD_HORIZON));
+    above = _mm256_add_ps(_mm256_max_ps(_mm256_sub_ps(t, h), zero), _mm256_set1_ps(GSD_BELOW));
+    r = _mm256_add_ps(_mm256_mul_ps(_mm256_mul_ps(r, r), _mm256_set1_ps(0.25f / GSD_HORIZON)), above);
+    return _mm256_mul_ps(_mm256_loadu_ps(mass + k), r);
+}
+
+/* gsd_orient. */
+GSDI_AVX2 static void gsdi_orient_avx2(const gsd_view *view, gsd_handle *handle, const float *n)
+{
+    __m256 normal[3], z = _mm256_setzero_ps();
+    float s[8];
+    uint32_t k;
+    if (handle->jump == 0 || handle->alpha >= 1 || !(n[0] * n[0] + n[1] * n[1] + n[2] * n[2] > 0.5f))
+        return;
+    for (k = 0; k < 3; ++k)
+        normal[k] = _mm256_set1_ps(n[k]);
+    for (k = 0; k < GSDI_BINS; k += 8)
+        z = _mm256_add_ps(z, gsdi_bin_row_avx2(view, normal, view->masses + handle->jump, k));
+    _mm256_storeu_ps(s, z);
+    memcpy(handle->normal, n, sizeof handle->normal);
+    handle->product = 1 / (((s[0] + s[1]) + (s[2] + s[3])) + ((s[4] + s[5]) + (s[6] + s[7])));
+}
+
+/* gsd_bin_weights. */
+GSDI_AVX2 static void gsdi_bin_weights_avx2(const gsd_view *view, const gsd_handle *handle, float *weight, float *row)
+{
+    __m256 normal[3], w[8], a, b;
+    uint32_t k;
+    for (k = 0; k < 3; ++k)
+        normal[k] = _mm256_set1_ps(handle->normal[k]);
+    for (k = 0; k < 8; ++k) {
+        w[k] = gsdi_bin_row_avx2(view, normal, view->masses + handle->jump, k * 8);
+        _mm256_storeu_ps(weight + k * 8, w[k]);
+    }
+    a = _mm256_hadd_ps(_mm256_hadd_ps(w[0], w[1]), _mm256_hadd_ps(w[2], w[3]));
+    b = _mm256_hadd_ps(_mm256_hadd_ps(w[4], w[5]), _mm256_hadd_ps(w[6], w[7]));
+    _mm_storeu_ps(row, _mm_add_ps(_mm256_castps256_ps128(a), _mm256_extractf128_ps(a, 1)));
+    _mm_storeu_ps(row + 4, _mm_add_ps(_mm256_castps256_ps128(b), _mm256_extractf128_ps(b, 1)));
+}
+#endif
+
+static void gsdi_orient(const gsd_view *view, gsd_handle *handle, const float *normal)
+{
+#if GSDI_X86
+    if (view->simd >= GSD_SIMD_AVX2) {
+        gsdi_orient_avx2(view, handle, normal);
+        return;
+    }
+#endif
+    gsd_orient(view, handle, normal);
+}
+
+GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const float *positions,
+                            size_t position_stride, const float *normals, size_t normal_stride, const float *u,
+                            size_t u_stride, gsd_handle *handles, float *alpha)
+{
+    uint32_t start, i, k, axis;
     for (start = 0; start < count; start += GSDI_LANES) {
         uint32_t n = count - start < GSDI_LANES ? count - start : GSDI_LANES;
         uint32_t cell[GSDI_LANES], g[GSDI_LANES][3];
@@ -2836,8 +3107,7 @@ GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t
         for (i = 0; i < n; ++i) {
             if (u) {
                 uint32_t at = gsdi_at(index, start + i);
-                handles[at] = gsd_find(view, gsdi_row(positions, position_stride, at), gsdi_row(u, u_stride, at));
-                cell[i] = handles[at].cell;
+                cell[i] = gsd_find(view, gsdi_row(positions, position_stride, at), NULL, gsdi_row(u, u_stride, at)).cell;
             } else {
                 cell[i] = gsd_cell_at(view, g[i]);
             }
@@ -2848,6 +3118,12 @@ GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t
             handles[at] = gsd_find_cell(view, cell[i]);
             if (alpha)
                 alpha[at] = handles[at].alpha;
+            for (k = 0; normals && k < GSDI_BINS; k += 16)
+                GSDI_PREFETCH(view->masses + handles[at].jump + k);
+        }
+        for (i = 0; normals && i < n; ++i) {
+            uint32_t at = gsdi_at(index, start + i);
+            gsdi_orient(view, &handles[at], gsdi_row(normals, normal_stride, at));
         }
     }
 }
@@ -2899,8 +3175,10 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
             shift[i] = shift[i] ? 21 : 24;
         }
         gsdi_descend(view, n, node, xy, shift);
-        for (i = 0; i < n; ++i)
-            pdf[gsdi_at(index, start + i)] = view->nodes[node[i]].leaf.pdf;
+        for (i = 0; i < n; ++i) {
+            uint32_t at = gsdi_at(index, start + i);
+            pdf[at] = gsd_oriented(view, &handles[at], view->nodes[node[i]].leaf.pdf, xy[i][0], xy[i][1]);
+        }
     }
 }
 
@@ -2961,7 +3239,11 @@ static int gsdi_draw_start(const gsd_view *view, const gsd_handle *h, const floa
     }
     d->r[0] = (d->r[0] - e) / (1 - e);
     d->r[0] = d->r[0] < 0.99999999988 ? d->r[0] : 0.99999999988;
-    if (h->alias_count) {
+    if (h->product > 0) {
+        float weight[GSDI_BINS], row[8];
+        gsd_bin_weights(view, h, weight, row);
+        d->node = gsd_choose_bin(view, h, weight, row, d->r);
+    } else if (h->alias_count) {
         double slot = d->r[0] * (double)h->alias_count;
         d->node = h->alias + (uint32_t)slot;
         d->r[0] = slot - (double)(uint32_t)slot;
@@ -2984,8 +3266,6 @@ static void gsdi_draw_alias(const gsd_view *view, gsdi_draw *d)
 }
 
 #if GSDI_X86
-#define GSDI_AVX2 __attribute__((target("avx2")))
-
 /* Sixteen draws as arrays. The steps are those of gsd_sample, in the same operations, so results are equal bit by bit.
  */
 typedef struct gsdi_draws {
@@ -2994,6 +3274,7 @@ typedef struct gsdi_draws {
     uint32_t node[GSDI_LANES];
     float out[3][GSDI_LANES], pdf[GSDI_LANES];
     uint32_t edge[GSDI_LANES]; /* not 0: near the leaf's edge */
+    uint32_t deep[GSDI_LANES]; /* not 0: the leaf lies within one bin */
 } gsdi_draws;
 
 /* Four 32-bit numbers without sign as doubles. */
@@ -3111,6 +3392,7 @@ GSDI_AVX2 static void gsdi_leaves_avx2(const gsd_view *view, gsdi_draws *d, uint
         __m128i y = _mm_castps_si128(half ? _mm256_extractf128_ps(column[3], 1) : _mm256_castps256_ps128(column[3]));
         __m256d size = _mm256_cvtepi32_pd(_mm_srlv_epi32(_mm_set1_epi32(16777216), _mm_srli_epi32(xd, 24)));
         __m256d edge = _mm256_setzero_pd(), corner[2];
+        _mm_storeu_si128((__m128i *)(void *)&d->deep[at], _mm_cmpgt_epi32(_mm_srli_epi32(xd, 24), _mm_set1_epi32(2)));
         corner[0] = _mm256_cvtepi32_pd(_mm_and_si128(xd, _mm_set1_epi32(0xffffff)));
         corner[1] = _mm256_cvtepi32_pd(y);
         for (k = 0; k < 2; ++k) {
@@ -3166,6 +3448,8 @@ GSDI_AVX2 static void gsdi_directions_avx2(gsdi_draws *d, uint32_t lane)
     _mm256_storeu_ps(&d->out[2][lane], z);
 }
 
+static bool gsdi_aliased(const gsd_handle *h) { return h->alias_count && !(h->product > 0); }
+
 /* Up to 16 draws. Those of the uniform share, and what has no alias table in a field of them, are done one by one. */
 GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const uint32_t *at, const gsd_handle *handles,
                                        const float *u, size_t u_stride, float *directions, size_t direction_stride,
@@ -3173,7 +3457,7 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
 {
     gsdi_draws d;
     double e = (double)view->uniform;
-    bool aliased = handles[at[0]].alias_count != 0, go[2] = {!aliased, !aliased};
+    bool aliased = gsdi_aliased(&handles[at[0]]), go[2] = {!aliased, !aliased};
     uint32_t i, k;
     for (i = 0; i < GSDI_LANES; ++i) {
         const float *v = gsdi_row(u, u_stride, at[i < n ? i : 0]);
@@ -3187,6 +3471,20 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
         GSDI_PREFETCH(&view->nodes[d.node[i]]);
     }
     gsdi_extend_avx2(&d, e);
+    for (i = 0; !aliased && i < n; ++i) {
+        const gsd_handle *h = &handles[at[i]];
+        float weight[GSDI_BINS], row[8];
+        double r[2];
+        if (!(h->product > 0))
+            continue;
+        gsdi_bin_weights_avx2(view, h, weight, row);
+        r[0] = d.r[0][i] > 0 ? d.r[0][i] : 0; /* the uniform share comes later */
+        r[1] = d.r[1][i];
+        d.node[i] = gsd_choose_bin(view, h, weight, row, r);
+        d.r[0][i] = r[0];
+        d.r[1][i] = r[1];
+        GSDI_PREFETCH(&view->nodes[d.node[i]]);
+    }
     for (i = 0; aliased && i < GSDI_LANES; ++i) {
         const gsd_handle *h = &handles[at[i < n ? i : 0]];
         double slot = d.r[0][i] * (double)h->alias_count;
@@ -3199,7 +3497,7 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
         const gsd_alias *a = &view->aliases[d.node[i]];
         double t = (double)a->threshold;
         bool own = d.r[0][i] < t;
-        if (!handles[at[i < n ? i : 0]].alias_count)
+        if (!gsdi_aliased(&handles[at[i < n ? i : 0]]))
             continue;
         d.lo[0][i] = own ? 0 : t;
         d.width[0][i] = own ? t : 1 - t;
@@ -3207,7 +3505,7 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
         GSDI_PREFETCH(&view->nodes[d.node[i]]);
     }
     for (i = 0; aliased && i < GSDI_LANES; ++i)
-        d.node[i] = handles[at[i < n ? i : 0]].alias_count ? d.node[i] : 0;
+        d.node[i] = gsdi_aliased(&handles[at[i < n ? i : 0]]) ? d.node[i] : 0;
     while (go[0] || go[1]) {
         go[0] = go[0] && gsdi_step_avx2(view, &d, 0);
         go[1] = go[1] && gsdi_step_avx2(view, &d, 8);
@@ -3219,13 +3517,16 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
     for (i = 0; i < n; ++i) {
         const gsd_handle *h = &handles[at[i]];
         float *out = gsdi_row_out(directions, direction_stride, at[i]);
-        if ((double)d.bits[0][i] < e * 16777216.0 + 1 || (h->alias_count != 0) != aliased) {
+        if ((double)d.bits[0][i] < e * 16777216.0 + 1 || gsdi_aliased(h) != aliased) {
             pdf[at[i]] = gsd_sample(view, h, gsdi_row(u, u_stride, at[i]), out);
             continue;
         }
         for (k = 0; k < 3; ++k)
             out[k] = d.out[k][i];
-        pdf[at[i]] = d.edge[i] ? gsd_pdf(view, h, out) : d.pdf[i];
+        if (d.edge[i] || (h->product > 0 && !d.deep[i]))
+            pdf[at[i]] = gsd_pdf(view, h, out);
+        else
+            pdf[at[i]] = gsd_oriented(view, h, d.pdf[i], (uint32_t)d.r[0][i], (uint32_t)d.r[1][i]);
     }
 }
 #endif
@@ -3276,7 +3577,8 @@ GSD_API void gsd_sample_batch(const gsd_view *view, uint32_t count, const uint32
 #define GSDI_OPTIONS(X)                                                                                                \
     X(uint64_t, max_bytes, uint64_t)                                                                                   \
     X(uint32_t, target, gsd_target)                                                                                    \
-    X(uint32_t, switch_pass, uint32_t)                                                                                 \
+    X(float, switch_after, float)                                                                                      \
+    X(float, smoothing, float)                                                                                         \
     X(uint32_t, max_depth, uint32_t)                                                                                   \
     X(uint32_t, max_levels, uint32_t)                                                                                  \
     X(uint32_t, min_samples, uint32_t)                                                                                 \
@@ -3306,9 +3608,9 @@ typedef struct gsdi_file {
     uint32_t byte_order, version;
     uint64_t size, checksum; /* of the whole save with checksum = 0 */
     uint64_t block_size, structure;
-    double first_pass_samples, last_pass_samples;
+    double first_pass_samples, last_pass_samples, all_samples, held_samples;
     gsd_stats stats; /* plain numbers without padding */
-    uint32_t cells, building_nodes, passes, first_pass_spp, pixels;
+    uint32_t cells, building_nodes, passes, learned, pixels;
     float bounds_min[3], bounds_max[3];
     GSDI_OPTIONS(GSDI_MEMBER)
 } gsdi_file;
@@ -3383,7 +3685,9 @@ GSD_API gsd_result gsd_save(const gsd_field *field, void *data, size_t capacity,
     f.cells = b->cells;
     f.building_nodes = nodes;
     f.passes = field->passes;
-    f.first_pass_spp = field->first_pass_spp;
+    f.learned = field->target;
+    f.all_samples = field->all_samples;
+    f.held_samples = field->held_samples;
     f.pixels = field->pixels;
     f.stats = field->stats;
     memcpy(f.bounds_min, field->desc.bounds_min, sizeof f.bounds_min);
@@ -3477,7 +3781,9 @@ GSD_API gsd_result gsd_load(const gsd_desc *desc, const void *data, size_t size,
     field->building_nodes = field->node_capacity = f.building_nodes;
     field->state_capacity = f.cells;
     field->passes = f.passes;
-    field->first_pass_spp = f.first_pass_spp;
+    field->target = f.learned;
+    field->all_samples = f.all_samples;
+    field->held_samples = f.held_samples;
     field->pixels = f.pixels;
     field->first_pass_samples = f.first_pass_samples;
     field->last_pass_samples = f.last_pass_samples;
@@ -3535,18 +3841,16 @@ static bool gsdi_tree_ok(const gsd_view *view, const gsdi_block *b, const gsdi_t
 
 static bool gsdi_jumps_ok(const gsd_view *view, const gsdi_block *b, const gsdi_tree *tree)
 {
-    uint32_t i, k;
+    uint32_t i;
+    float mass;
     if (tree->jump == 0)
-        return true;
-    if (tree->jump % 64 || tree->jump > b->jumps - 64)
+        return tree->groups == 0;
+    if (tree->jump % GSDI_BINS || tree->jump > b->jumps - GSDI_BINS)
         return false;
-    for (i = 0; i < 64; ++i) {
-        uint32_t node = tree->root;
-        for (k = 0; k < 3 && view->nodes[node].inner.child; ++k)
-            node = view->nodes[node].inner.child + ((i >> (2 - k)) & 1u) + 2 * ((i >> (5 - k)) & 1u);
-        if (view->jumps[tree->jump + i] != node)
+    for (i = 0; i < GSDI_BINS; ++i)
+        if (view->jumps[tree->jump + i] != gsdi_tree_bin(view->nodes, tree->root, i, &mass) ||
+            memcmp(&view->masses[tree->jump + i], &mass, sizeof mass) != 0)
             return false;
-    }
     return true;
 }
 
@@ -3649,7 +3953,7 @@ static bool gsdi_state_ok(const gsd_field *field, const gsdi_state *s, const gsd
     uint32_t k;
     if (c->tree >= field->block->trees || s->gate > GSD_GATE_CLOSED || !(s->alpha >= 0.049f && s->alpha <= 1) ||
         !(s->theta > -10 && s->theta < 10) || !gsdi_finite(s->moment1) || !gsdi_finite(s->moment2) ||
-        !(s->held >= 0 && s->held < 1e18) || !(s->fresh >= 0 && s->fresh < 1e18) || !(s->flow >= 0 && s->flow < 1e50) ||
+        !(s->held >= 0 && s->held < 1e18) || !(s->lit >= 0 && s->lit < 1e18) || !(s->fresh >= 0 && s->fresh < 1e18) || !(s->flow >= 0 && s->flow < 1e50) ||
         !(s->gate_count >= 0) || !(s->weight >= 0 && s->weight < 1e300) || !(s->pixel >= 0 && s->pixel < 1e300) ||
         !(s->pixel_v >= 0 && s->pixel_v < 1e300) || s->level > 60)
         return false;
@@ -3698,7 +4002,7 @@ GSD_API gsd_result gsd_merge(gsd_field *field, const gsd_field *source)
     uint32_t i, k;
     if (field->structure != source->structure || field->block->cells != source->block->cells ||
         field->building_nodes != source->building_nodes || field->passes != source->passes ||
-        gsdi_pass_target(&field->desc, field->passes) != gsdi_pass_target(&source->desc, source->passes))
+        field->target != source->target)
         return GSD_MISMATCH;
     for (i = 0; i < field->building_nodes; ++i)
         field->sum[i] += source->sum[i];
@@ -3707,6 +4011,7 @@ GSD_API gsd_result gsd_merge(gsd_field *field, const gsd_field *source)
         const gsdi_state *o = &source->states[i];
         double both = s->fresh + o->fresh, share = both > 0 ? o->fresh / both : 0;
         s->held += o->held;
+        s->lit += o->lit;
         s->fresh += o->fresh;
         s->flow += o->flow;
         s->gate_count += o->gate_count;
@@ -3778,7 +4083,7 @@ static void gsdi_export_building(const gsd_field *field, const gsdi_state *s, gs
     } stack[GSDI_STACK], v;
     const uint32_t *child = field->child + s->first;
     const double *sum = field->sum + s->first;
-    bool second_moment = gsdi_pass_target(&field->desc, field->passes) != GSD_TARGET_RADIANCE;
+    bool second_moment = field->target != GSD_TARGET_RADIANCE;
     uint32_t top = 0, k;
     stack[top].inner = stack[top].depth = 0;
     ++top;
@@ -3907,7 +4212,7 @@ GSD_API gsd_result gsd_import_trees(gsd_field *field, const gsd_tree *trees, uin
         gsdi_tree *tree = &r.trees[job->tree];
         if (job->rebuild) {
             gsdi_import_convert(&trees[job->rebuild - 1], r.desc->max_depth, r.child, r.mass, r.depth);
-            gsdi_tree_write(r.block, tree, r.child, r.mass);
+            gsdi_tree_write(r.block, tree, r.child, r.mass, 1, 0);
         } else if (job->copy) {
             gsdi_tree_copy(r.block, tree, old, &gsdi_trees(old)[gsdi_cells(old)[i].tree]);
         }

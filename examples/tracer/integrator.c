@@ -56,7 +56,7 @@ struct tr_worker {
     /* Vertices with a smooth part, by their place k in the lookup. */
     int smooth[TR_BATCH], smooth_count;
     int place[TR_BATCH]; /* path -> k, -1 = none */
-    vec3 p[TR_BATCH], ns[TR_BATCH], wo[TR_BATCH];
+    vec3 p[TR_BATCH], side[TR_BATCH], wo[TR_BATCH];
     float roughness[TR_BATCH], find_u[TR_BATCH][3], alpha[TR_BATCH], reflected[TR_BATCH];
     void *handles;
     int index[TR_BATCH];
@@ -360,7 +360,7 @@ static void find_handles(tr_worker *w, const tr_frame *frame)
         if (!guiding)
             continue;
         w->p[k] = w->surfaces[id].p;
-        w->ns[k] = c->frame.n;
+        w->side[k] = c->transmits ? v3s(0) : c->frame.n;
         w->wo[k] = neg3(w->paths[id].direction);
         w->roughness[k] = c->roughness;
         for (int j = 0; j < 3; ++j)
@@ -369,7 +369,7 @@ static void find_handles(tr_worker *w, const tr_frame *frame)
     if (!guiding || w->smooth_count == 0)
         return;
     double start = tr_wall_seconds();
-    tr_lookup lookup = {w->smooth_count, w->p, w->ns, w->wo, w->roughness, (const float(*)[3])w->find_u};
+    tr_lookup lookup = {w->smooth_count, w->p, w->side, w->wo, w->roughness, (const float(*)[3])w->find_u};
     frame->method->find(frame->method_data, &lookup, w->handles, w->alpha);
     w->counters.query += tr_wall_seconds() - start;
     for (int k = 0; k < w->smooth_count; ++k)
@@ -627,7 +627,7 @@ static void fill_vertex(tr_worker *w, const tr_frame *frame, int id, const choic
     v->alpha = w->alpha[k];
     v->pdf_guide = v->alpha < 1 ? smooth * w->pdf_guide[k] : 0;
     v->u = 0;
-    v->flags = p->seen ? 0 : TR_VERTEX_FIRST;
+    v->flags = (p->seen ? 0 : TR_VERTEX_FIRST) | (c->transmits ? TR_VERTEX_PASSES : 0);
     if (black3(ch->f))
         v->flags |= TR_VERTEX_REJECTED;
     v->pixel_weight = throughput;

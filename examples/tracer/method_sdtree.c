@@ -1,10 +1,10 @@
 /* method_sdtree.c: guide_sdtree.h as a method of the example renderer.
 
-   Options (--set key=value), defaults as in guide_sdtree.h: target=radiance|simple|variance|switching, switch_pass, c
-   (samples of a cell before it splits), rho, max_depth, max_levels, min_samples, max_memory_mb,
+   Options (--set key=value), defaults as in guide_sdtree.h: target=radiance|simple|variance|switching, switch_after, c
+   (samples of a cell before it splits), rho, smoothing, max_depth, max_levels, min_samples, max_memory_mb,
    spatial_filter=nearest|stochastic, directional_filter=nearest|box, learn_alpha=grid|adam|off (on = grid), alpha,
    gate=on|off, gate_margin, gate_gain, gate_probe, guide_weight=on|off, history=on|off, uniform, alias=on|off,
-   simd=scalar|avx2|avx512, jitter=on|off (find looks up a jittered position), sparse=on|off (closed fields record only
+   simd=scalar|avx2|avx512, product=on|off (with the cosine), jitter=on|off (find looks up a jittered position), sparse=on|off (closed fields record only
    some tiles). */
 #include <stdlib.h>
 #include <string.h>
@@ -19,7 +19,7 @@ typedef struct sdtree {
     gsd_view view;
     gsd_stream **streams;
     int tiles;
-    bool jitter, sparse;
+    bool product, jitter, sparse;
     float fraction; /* of the tiles that record in this pass */
     int pass;
     uint64_t stream_peak;
@@ -86,9 +86,10 @@ static bool parse(parser *p, gsd_desc *d, sdtree *m)
 {
     int learn;
     d->target = (gsd_target)(choice(p, "target", "radiance|simple|variance|switching") + 1);
-    d->switch_pass = (uint32_t)number(p, "switch_pass", 0);
+    d->switch_after = (float)number(p, "switch_after", 0);
     d->split_samples = (float)number(p, "c", 0);
     d->rho = (float)number(p, "rho", 0);
+    d->smoothing = (float)number(p, "smoothing", 0);
     d->max_depth = (uint32_t)number(p, "max_depth", 0);
     d->max_levels = (uint32_t)number(p, "max_levels", 0);
     d->min_samples = (uint32_t)number(p, "min_samples", 0);
@@ -107,6 +108,7 @@ static bool parse(parser *p, gsd_desc *d, sdtree *m)
     d->no_history = choice(p, "history", "off|on") == 0;
     d->alias = choice(p, "alias", "off|on") == 1;
     d->simd = (gsd_simd)(choice(p, "simd", "scalar|avx2|avx512") + 1);
+    m->product = choice(p, "product", "off|on") != 0;
     m->jitter = choice(p, "jitter", "off|on") == 1;
     m->sparse = choice(p, "sparse", "off|on") != 0;
     return p->ok;
@@ -177,15 +179,17 @@ static bool sdtree_wants_records(void *method, int tile)
     return floor(start + (double)m->fraction) > floor(start);
 }
 
-static gsd_training_sample convert(const tr_vertex *v)
+static gsd_training_sample convert(const sdtree *m, const tr_vertex *v)
 {
-    float p[3], d[3], L[3], f[3], w[3];
+    float p[3], d[3], n[3], L[3], f[3], w[3];
     memcpy(p, &v->p, sizeof p);
     memcpy(d, &v->wi, sizeof d);
+    memcpy(n, &v->ns, sizeof n);
     memcpy(L, &v->L, sizeof L);
     memcpy(f, &v->f, sizeof f);
     memcpy(w, &v->pixel_weight, sizeof w);
-    gsd_training_sample s = gsd_make_sample(p, d, L, f, v->cosine, w, v->pdf_mix, v->pdf_bsdf, v->pdf_guide);
+    gsd_training_sample s = gsd_make_sample(p, d, m->product && !(v->flags & TR_VERTEX_PASSES) ? n : NULL, L, f, v->cosine, w,
+                                            v->pdf_mix, v->pdf_bsdf, v->pdf_guide);
     if (v->flags & TR_VERTEX_REJECTED) {
         s.radiance = GSD_REJECTED;
         s.contribution = s.pixel_contribution = 0;
@@ -201,7 +205,7 @@ static bool sdtree_record(void *method, int tile, const tr_vertex *vertices, int
     for (int done = 0; done < n;) {
         int k = 0;
         for (; k < 64 && done < n; ++k, ++done)
-            samples[k] = convert(&vertices[done]);
+            samples[k] = convert(m, &vertices[done]);
         ok = !gsd_record(m->streams[tile], samples, (uint32_t)k) && ok;
     }
     return ok;
@@ -226,7 +230,6 @@ static bool sdtree_end_pass(void *method, const tr_pass *pass)
     if (pass->last)
         return true;
     sdtree_flush(m);
-    info.spp = (uint32_t)pass->spp;
     info.pixel_estimate = pass->index > 0; /* of the passes before */
     gsd_result result = gsd_refine(m->field, &info, m->parallel, m->parallel_user);
     m->view = gsd_get_view(m->field);
@@ -246,6 +249,7 @@ static void sdtree_find(void *method, const tr_lookup *lookup, void *handles, fl
         return;
     }
     gsd_find_batch(&m->view, (uint32_t)lookup->n, NULL, &lookup->p->x, sizeof(vec3),
+                   m->product ? &lookup->side->x : NULL, sizeof(vec3),
                    m->jitter && lookup->u ? lookup->u[0] : NULL, sizeof lookup->u[0], handles, alpha);
 }
 
@@ -276,20 +280,14 @@ static void sdtree_reflected(void *method, int n, const void *handles, float *ra
 
 /* ---- reports */
 
-/* Cell number, and depth of the leaf that the normal +z points into. */
+/* Cell number, and depth of its quadtree. */
 static void sdtree_describe(void *method, int n, const void *handles, float *cell, float *depth)
 {
     const sdtree *m = method;
     const gsd_handle *h = handles;
     for (int i = 0; i < n; ++i) {
-        uint32_t deepest = 0;
-        for (uint32_t k = 0; k < 64; ++k) { /* deepest of 64 probes */
-            uint32_t x = (k % 8 * 2 + 1) << 20, y = (k / 8 * 2 + 1) << 20;
-            uint32_t leaf = m->view.nodes[gsd_leaf_at(&m->view, &h[i], x, y)].leaf.x >> 24;
-            deepest = leaf > deepest ? leaf : deepest;
-        }
         cell[i] = (float)h[i].cell;
-        depth[i] = (float)deepest;
+        depth[i] = (float)m->view.cells[h[i].cell].depth;
     }
 }
 

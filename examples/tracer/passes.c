@@ -1,5 +1,5 @@
-/* passes.c: the pass loop: 1, 2, 4, ... samples per pixel, learning after each, images combined by one scalar weight
-   per pass.
+/* passes.c: the pass loop: growing passes, learning after each, images combined by one scalar weight per group of
+   passes.
 
      >>rounds   a pass is cut into rounds of bounded memory; the method takes its records in after each
      >>combine  groups of passes, their variances and weights
@@ -12,13 +12,14 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define MAX_PASSES 32
+#define MAX_GROUPS 32
+#define GROWTH 4 /* a learning pass is 1 / GROWTH of all before it */
 #define ROUND_PATHS (1 << 17) /* paths between two flushes: bounds the memory of records */
 
-/* Passes that were sampled in the same way: plain sums are the best way to join them. */
+/* Passes that were sampled in the same way, or nearly so: plain sums are the best way to join them. */
 typedef struct group {
     double *sum, *sum_squares;
-    int spp;
+    int spp, first_spp; /* first_spp: samples of the image when it began, >= 1 */
     bool guided;
     double variance; /* per sample, relative, trimmed mean over pixels */
     double weight;
@@ -32,7 +33,7 @@ typedef struct render_state {
     int idle_count, worker_count;
     pthread_mutex_t lock;
     tr_worker **workers;
-    group groups[MAX_PASSES];
+    group groups[MAX_GROUPS];
     int group_count;
     tr_image estimate, combined, variance;
     tr_result *result;
@@ -91,10 +92,32 @@ static int samples_per_round(const render_state *r)
 
 /* ---- >>combine ---------------------------------------------------------------------------------------------- */
 
-static int compare_doubles(const void *a, const void *b)
+/* Move the `keep` smallest of n values to the front (Hoare's selection, middle pivot). */
+static void select_smallest(double *value, size_t n, size_t keep)
 {
-    double x = *(const double *)a, y = *(const double *)b;
-    return (x > y) - (x < y);
+    size_t lo = 0, hi = n;
+    while (hi - lo > 1 && keep > lo && keep < hi) {
+        double pivot = value[lo + (hi - lo) / 2];
+        size_t i = lo, j = hi - 1;
+        for (;;) {
+            while (value[i] < pivot)
+                ++i;
+            while (value[j] > pivot)
+                --j;
+            if (i >= j)
+                break;
+            double t = value[i];
+            value[i++] = value[j];
+            value[j--] = t;
+        }
+        size_t middle = value[i] < pivot ? i + 1 : i; /* [lo, middle) <= pivot <= [middle, hi) */
+        if (middle == lo)
+            middle = lo + 1;
+        if (keep <= middle)
+            hi = middle;
+        if (keep >= middle)
+            lo = middle;
+    }
 }
 
 /* Mean over pixels of the per-sample variance over (estimate^2 + floor^2), without the worst 0.1 % of pixels: the
@@ -118,8 +141,8 @@ static double relative_variance(const render_state *r, const group *g)
             value[i] += (v > 0 ? v : 0) / ((double)r->estimate.data[c] * r->estimate.data[c] + floor2) / 3;
         }
     }
-    qsort(value, n, sizeof *value, compare_doubles);
     size_t keep = n - n / 1000;
+    select_smallest(value, n, keep);
     double sum = 0;
     for (size_t i = 0; i < keep; ++i)
         sum += value[i];
@@ -299,13 +322,16 @@ static uint64_t total_guided(const render_state *r)
     return n;
 }
 
-/* Close a pass: its sums join the last group if both were unguided, or become a group. */
-static bool close_pass(render_state *r, int spp, bool guided)
+/* Close a pass of spp samples after done_spp earlier ones: its sums join the last group or become one. */
+static bool close_pass(render_state *r, int done_spp, int spp, bool guided)
 {
     size_t n = 3 * pixel_count(r);
     tr_frame *f = &r->frame;
     group *g = r->group_count ? &r->groups[r->group_count - 1] : NULL;
-    bool join = g && (!r->settings->method->learns || (!g->guided && !guided));
+    /* Passes grow slowly, and so does what they know: a new group begins where the image has twice the samples that it
+       had when the last one began. */
+    bool join = g && (!r->settings->method->learns || (!g->guided && !guided) ||
+                      (g->guided && guided && done_spp < 2 * g->first_spp) || r->group_count == MAX_GROUPS);
     if (!join) {
         g = &r->groups[r->group_count];
         g->sum = zalloc(n, sizeof(double));
@@ -314,6 +340,7 @@ static bool close_pass(render_state *r, int spp, bool guided)
         if (!g->sum || !g->sum_squares)
             return false;
         g->guided = guided;
+        g->first_spp = done_spp > 1 ? done_spp : 1;
     }
     for (size_t i = 0; i < n; ++i) {
         g->sum[i] += f->sum[i];
@@ -367,11 +394,15 @@ static bool learn(render_state *r, const tr_pass *pass)
     return ok;
 }
 
+/* Samples of a learning pass: a quarter of all before it. Guiding learns in generations, each from paths that the one
+   before has guided; sums live on from pass to pass, so passes need not double. */
+static int pass_spp(int done_spp) { return done_spp < 4 ? 1 : done_spp / GROWTH; }
+
 /* Samples for pass k. A pass that would leave too little for a full next one takes the rest instead; `last` tells. */
 static int plan_pass(const render_state *r, int pass, int done_spp, double cost_per_sample, bool *last)
 {
     const tr_settings *s = r->settings;
-    int spp = 1 << (pass < 24 ? pass : 24);
+    int spp = r->settings->method->learns ? pass_spp(done_spp) : 1 << (pass < 24 ? pass : 24);
     *last = false;
     if (s->spp > 0) {
         int left = s->spp - done_spp;
@@ -391,7 +422,7 @@ static bool run_passes(render_state *r)
     bool out_of_time = false, ok = true;
     double cost = 0;
     int done = 0;
-    for (int pass = 0; pass < MAX_PASSES && !out_of_time && ok && (s->spp <= 0 || done < s->spp); ++pass) {
+    for (int pass = 0; pass < TR_MAX_PASSES && !out_of_time && ok && (s->spp <= 0 || done < s->spp); ++pass) {
         tr_pass info = {pass, 0, false, s->seconds > 0 ? cpu_used(r) / s->seconds : (double)done / s->spp};
         info.spp = plan_pass(r, pass, done, cost, &info.last);
         double cpu = cpu_used(r);
@@ -402,7 +433,7 @@ static bool run_passes(render_state *r)
         done += taken;
         info.spp = taken;
         cost = (cpu_used(r) - cpu) / taken;
-        ok = close_pass(r, taken, total_guided(r) > guided_before);
+        ok = close_pass(r, done - taken, taken, total_guided(r) > guided_before);
         if (ok && !info.last && !out_of_time)
             ok = learn(r, &info);
         res->pass[pass].spp = taken;

@@ -411,6 +411,7 @@ typedef struct tr_vertex {
 } tr_vertex;
 #define TR_VERTEX_REJECTED 1u /* the direction was refused before tracing: f = 0, L = 0 */
 #define TR_VERTEX_FIRST 2u    /* first non-delta vertex seen by the camera */
+#define TR_VERTEX_PASSES 4u   /* light also passes through: directions on both sides of ns */
 
 /* ---- >>method ----------------------------------------------------------------------------------------------- */
 
@@ -444,7 +445,7 @@ typedef struct tr_pass {
 /* A batch of vertices to look up; arrays of n. */
 typedef struct tr_lookup {
     int n;
-    const vec3 *p, *ns, *wo;
+    const vec3 *p, *side, *wo; /* side: shading normal that light must be above; 0 where light also passes through */
     const float *roughness;
     const float (*u)[3]; /* random numbers in [0,1)^3 for stochastic lookup */
 } tr_lookup;
@@ -515,6 +516,7 @@ typedef struct tr_settings {
     void *progress_user;
 } tr_settings;
 
+#define TR_MAX_PASSES 256
 typedef struct tr_result {
     tr_image color, variance, albedo, normal, alpha, cell, depth; /* variance: of the pixel mean */
     int spp, passes;
@@ -526,7 +528,7 @@ typedef struct tr_result {
     struct tr_pass_result {
         int spp;
         double weight, variance, cpu_seconds;
-    } pass[32];
+    } pass[TR_MAX_PASSES];
 } tr_result;
 
 bool tr_render(const tr_scene *scene, const tr_settings *settings, tr_result *result, char *err, size_t err_size);
