@@ -81,11 +81,11 @@
    OPTIONS: see gsd_desc. gsd_resolve fills in defaults, gsd_get_desc returns what a field uses.
 
    MEMORY
-     Sampling part: 16 bytes per quadtree node, 36 per cell, 28 per quadtree, 256 per quadtree of more than 64 nodes
-     (a table that skips three levels), 12 per leaf with desc.alias, 4 per spatial node, and 16 KB.
+     Sampling part: 16 bytes per quadtree node, 40 per cell, 32 per quadtree, 512 per learned quadtree (bins of
+     directions: skip three levels, carry the cosine), 12 per leaf with desc.alias, 4 per spatial node, and 16 KB.
      Building part: 12 bytes per quadtree node, sizeof(gsd_cell_state) (below 600) per cell.
      max_bytes bounds the peak of both parts while refine runs, old and new together: trees coarsen and cells stop
-     splitting; it never fails. Streams (48 bytes per sample) and the scratch of accumulate (at most 12 MB and 8 bytes
+     splitting; it never fails. Streams (44 bytes per sample) and the scratch of accumulate (at most 12 MB and 8 bytes
      per cell, kept for the next call) come on top. Allocation happens in create, stream_create, record, accumulate,
    refine, import, load, gsd_forest_split; never in a query. Stack: below 16 KB per call.
 
@@ -200,8 +200,7 @@ typedef enum gsd_simd { GSD_SIMD_AUTO, GSD_SIMD_SCALAR, GSD_SIMD_AVX2, GSD_SIMD_
 typedef struct gsd_desc {
     float bounds_min[3], bounds_max[3]; /* world-space box of the positions; made a cube and 0.1 % larger */
     gsd_target target;
-    float switch_after;   /* switching: variance-aware once this many times the first pass's samples were seen,
-                             0.001 .. 1e6; default 4 */
+    float switch_after;   /* first passes' worth of samples before variance-aware, 0.001 .. 1e6; default 4 */
     float split_samples;  /* c, samples a cell holds before it splits, 16 .. 1e9; default 1000 */
     float rho;            /* share of a quadtree's mass above which a node is divided, 1e-5 .. 1; default 0.01 */
     uint32_t max_depth;   /* of quadtrees, 1 .. 20; default 16 */
@@ -216,8 +215,7 @@ typedef struct gsd_desc {
     bool no_gate;  /* guide in every cell */
     bool no_guide_weight;  /* second-moment targets: w = 1 */
     bool no_history;       /* clear the sums in every refine; see HOW IT WORKS */
-    float smoothing;       /* samples that say "even": the children's shares of a quadtree node with n non-zero samples
-                              are (n share + smoothing / 4) / (n + smoothing), 0.001 .. 1000; default 3 */
+    float smoothing;       /* samples' worth of evenness in each node's shares, 0.001 .. 1000; default 3; see below */
     bool alias;            /* build alias tables: sampling in constant time, but not monotone in u; + 12 bytes a leaf */
     float gate_margin;     /* V(1) / V(a) - 1 below which guiding does not pay, 0.001 .. 10; default 0.05 */
     float gate_gain;       /* V(1) - V(a) below which guiding does not pay, 0.0001 .. 1000; default 0.25 */
@@ -663,26 +661,30 @@ GSD_QUERY float gsd_sample_leaf(const gsd_view *view, const gsd_handle *handle, 
     return gsd_oriented(view, handle, leaf->leaf.pdf, left, low);
 }
 
+/* Place of r (0 .. 1) among 8 weights; r becomes the place within that weight's share. Without branches. */
+GSD_QUERY uint32_t gsd_choose_of_eight(const float *weight, double *r)
+{
+    float prefix[8];
+    double t;
+    uint32_t i, k = 0;
+    prefix[0] = weight[0];
+    for (i = 1; i < 8; ++i)
+        prefix[i] = prefix[i - 1] + weight[i];
+    t = *r * (double)prefix[7];
+    for (i = 0; i < 7; ++i)
+        k += t >= (double)prefix[i];
+    t = (t - (double)(k ? prefix[k - 1] : 0)) / (double)weight[k];
+    *r = t > 0 ? t < 0.99999999988 ? t : 0.99999999988 : 0; /* a weight of 0 gives NaN or infinity: any place will do */
+    return k;
+}
+
 /* First step of sampling a product: choose a row of bins by r[1], a bin in it by r[0], which become the place in the
-   node that the bin's jump leads to. row: sums of the rows' probabilities before normalisation. */
+   node that the bin's jump leads to. weight, row: from gsd_bin_weights. */
 GSD_QUERY uint32_t gsd_choose_bin(const gsd_view *view, const gsd_handle *handle, const float *weight, const float *row,
                                   double r[2])
 {
-    double total = 0, t, w;
-    uint32_t x, y, node, depth, mask;
-    for (y = 0; y < 8; ++y)
-        total += (double)row[y];
-    t = r[1] * total;
-    for (y = 0; y < 7 && t >= (double)row[y]; ++y)
-        t -= (double)row[y];
-    r[1] = t / (double)row[y];
-    t = r[0] * (double)row[y];
-    for (x = 0; x < 7 && t >= (double)weight[y * 8 + x]; ++x)
-        t -= (double)weight[y * 8 + x];
-    w = (double)weight[y * 8 + x];
-    r[0] = w > 0 && t < w ? t / w : 0.99999999988;
-    r[1] = r[1] < 0.99999999988 ? r[1] : 0.99999999988;
-    node = view->jumps[handle->jump + y * 8 + x];
+    uint32_t y = gsd_choose_of_eight(row, &r[1]), x = gsd_choose_of_eight(weight + y * 8, &r[0]);
+    uint32_t node = view->jumps[handle->jump + y * 8 + x], depth, mask;
     if (view->nodes[node].leaf.child == 0 && (depth = view->nodes[node].leaf.x >> 24) < 3) { /* the bin is a part */
         double part = 1.0 / (double)(8u >> depth);
         mask = (8u >> depth) - 1;
@@ -885,6 +887,9 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 
 #define GSDI_NONE 0xffffffffu
 #define GSDI_GRID 4096u       /* 16^3 links */
+#ifndef GSDI_HALF
+#define GSDI_HALF 0.5
+#endif
 #define GSDI_BINS 64u         /* 8 x 8 bins of directions: nodes of depth 3 */
 #define GSDI_ROUND (1u << 18) /* samples sorted at once */
 #define GSDI_SEGMENT 2048u    /* samples prepared at once */
@@ -2485,7 +2490,7 @@ static void gsdi_pass_scale(gsdi_refinement *r, double samples)
     growth = growth > 1 ? growth < 2 ? growth : 2 : 1;
     r->fade = growth < 1.05 ? 0.95 : 1 / growth;
     r->split = (double)r->desc->split_samples * sqrt(first > 0 && held > first ? held / first : 1);
-    r->keep = held > 0 ? 0.5 * (all - growth * samples) / held : 0;
+    r->keep = held > 0 ? GSDI_HALF * (all - growth * samples) / held : 0;
     r->keep = r->desc->no_history || r->keep < 0 ? 0 : r->keep < 1 ? r->keep : 1;
     r->target = (gsd_target)field->target;
     if (r->desc->target == GSD_TARGET_SWITCHING && all >= (double)r->desc->switch_after * first)

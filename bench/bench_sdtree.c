@@ -74,7 +74,7 @@ static void row(const char *name, double ns, double limit, double naive, double 
 static gsd_training_sample to_training(const sf1_sample *s)
 {
     float contribution = s->radiance * s->cosine * (float)(1 / SF1_PI);
-    return gsd_make_scalar_sample(s->position, s->direction, s->radiance, contribution, contribution, s->pdf,
+    return gsd_make_scalar_sample(s->position, s->direction, NULL, s->radiance, contribution, contribution, s->pdf,
                                   s->cosine * (float)(1 / SF1_PI), 0);
 }
 
@@ -196,7 +196,7 @@ static queries make_queries(uint32_t count, const gsd_view *view)
             q.u[2 * i + k] = (float)(sf1_u64(&rng) >> 40) * 0x1p-24f;
     }
     for (uint32_t i = 0; i < count; ++i) { /* another point's random numbers, so that the directions are no samples */
-        gsd_handle h = gsd_find(view, &q.position[3 * i], NULL);
+        gsd_handle h = gsd_find(view, &q.position[3 * i], NULL, NULL);
         gsd_sample(view, &h, &q.u[2 * ((i + 1) % count)], &q.guided[3 * i]);
         gsd_extend_random(&q.u[2 * i], &q.u_d[2 * i]);
         for (int k = 0; k < 3; ++k) {
@@ -248,7 +248,7 @@ static queries sorted_queries(const queries *from, const gsd_view *view)
     queries q = make_queries(from->count, view);
     order_key *key = allocate(q.count, sizeof *key);
     for (uint32_t i = 0; i < q.count; ++i) {
-        key[i].cell = gsd_find(view, &q.position[3 * i], NULL).cell;
+        key[i].cell = gsd_find(view, &q.position[3 * i], NULL, NULL).cell;
         key[i].index = i;
     }
     qsort(key, q.count, sizeof *key, compare_keys);
@@ -275,16 +275,16 @@ typedef struct results {
 static void find_scalar(const gsd_view *v, const queries *q, uint32_t at, uint32_t n, results *r)
 {
     for (uint32_t i = 0; i < n; ++i)
-        r->handle[i] = gsd_find(v, &q->position[3 * (at + i)], NULL);
+        r->handle[i] = gsd_find(v, &q->position[3 * (at + i)], NULL, NULL);
 }
 static void find_batch(const gsd_view *v, const queries *q, uint32_t at, uint32_t n, results *r)
 {
-    gsd_find_batch(v, n, NULL, &q->position[3 * at], 12, NULL, 0, r->handle, NULL);
+    gsd_find_batch(v, n, NULL, &q->position[3 * at], 12, NULL, 0, NULL, 0, r->handle, NULL);
 }
 static void sample_scalar(const gsd_view *v, const queries *q, uint32_t at, uint32_t n, results *r)
 {
     for (uint32_t i = 0; i < n; ++i) {
-        gsd_handle h = gsd_find(v, &q->position[3 * (at + i)], NULL);
+        gsd_handle h = gsd_find(v, &q->position[3 * (at + i)], NULL, NULL);
         r->pdf[i] = gsd_sample(v, &h, &q->u[2 * (at + i)], &r->direction[3 * i]);
     }
 }
@@ -296,7 +296,7 @@ static void sample_batch(const gsd_view *v, const queries *q, uint32_t at, uint3
 static void pdf_scalar(const gsd_view *v, const queries *q, uint32_t at, uint32_t n, results *r)
 {
     for (uint32_t i = 0; i < n; ++i) {
-        gsd_handle h = gsd_find(v, &q->position[3 * (at + i)], NULL);
+        gsd_handle h = gsd_find(v, &q->position[3 * (at + i)], NULL, NULL);
         r->pdf[i] = gsd_pdf(v, &h, &q->uniform[3 * (at + i)]);
     }
 }
@@ -527,7 +527,9 @@ static gsd_field *learn(const gsd_desc *desc, int log2n, uint64_t seed, int exac
         for (i = 0; naive && i < count; ++i) {
             const gsd_training_sample *s = &samples[i];
             double p[3] = {(double)s->position[0], (double)s->position[1], (double)s->position[2]};
-            double w[3] = {(double)s->direction[0], (double)s->direction[1], (double)s->direction[2]};
+            float d[3];
+            gsd_direction((s->direction[0] & 0xffffff) + 0.5, (s->direction[1] & 0xffffff) + 0.5, d);
+            double w[3] = {(double)d[0], (double)d[1], (double)d[2]};
             naive_record(naive, p, w, (double)s->radiance / (double)s->pdf_mix);
         }
         if (naive) {
@@ -548,7 +550,7 @@ static double field_pdf(void *user, const sf1_point *point, const double *direct
         p[k] = (float)point->x[k];
         w[k] = (float)direction[k];
     }
-    gsd_handle h = gsd_find(view, p, NULL);
+    gsd_handle h = gsd_find(view, p, NULL, NULL);
     return (double)gsd_pdf(view, &h, w);
 }
 
@@ -570,7 +572,7 @@ static void validate_learning(const options *o)
     desc.no_history = desc.no_gate = true;
     gsd_field *field = learn(&desc, 17, 1, 0, &t, &naive, &seconds);
     gsd_view view = gsd_get_view(field);
-    gsd_handle handle = gsd_find(&view, middle, NULL);
+    gsd_handle handle = gsd_find(&view, middle, NULL, NULL);
     for (uint32_t i = 0; i < n; ++i) {
         double d[3];
         float u[2] = {(float)(bench_random(&seed) >> 40) * 0x1p-24f, (float)(bench_random(&seed) >> 40) * 0x1p-24f},

@@ -61,7 +61,9 @@ static float radiance(float p[3], int axis, float side, float weight, const gsd_
     float emitted[DEPTH], cosine[DEPTH], light = 0;
     int n = 0;
     while (n < DEPTH) {
-        gsd_handle handle = gsd_find(field, p, NULL);
+        float normal[3] = {0, 0, 0};
+        normal[axis] = side;
+        gsd_handle handle = gsd_find(field, p, normal, NULL);
         float alpha = stream ? handle.alpha : 1, u[2] = {random_float(), random_float()}, d[3];
         if (random_float() < alpha)
             scatter(axis, side, d);
@@ -71,7 +73,8 @@ static float radiance(float p[3], int axis, float side, float weight, const gsd_
         float pdf_bsdf = fmaxf(d[axis] * side, 0) / 3.14159265f;
         float pdf = alpha < 1 ? alpha * pdf_bsdf + (1 - alpha) * pdf_guide : pdf_bsdf;
         cosine[n] = d[axis] * side;
-        vertex[n] = gsd_make_scalar_sample(p, d, cosine[n] > 0 ? 0 : GSD_REJECTED, 0, weight, pdf, pdf_bsdf, pdf_guide);
+        vertex[n] = gsd_make_scalar_sample(p, d, normal, cosine[n] > 0 ? 0 : GSD_REJECTED, 0, weight, pdf, pdf_bsdf,
+                                           pdf_guide);
         weight *= ALBEDO / 3.14159265f * cosine[n] / pdf;
         emitted[n++] = 0;
         if (!(cosine[n - 1] > 0) || !(pdf > 0)) /* into the wall */
@@ -99,7 +102,7 @@ static double render(float *image, gsd_field *field, gsd_stream *stream)
     for (int pass = 0; pass < PASSES; ++pass) {
         static float picture[SIZE * SIZE];
         gsd_view view = gsd_get_view(field);
-        gsd_pass info = {.spp = 2u << pass, .pixel_estimate = pass > 0};
+        gsd_pass info = {.pixel_estimate = pass > 0};
         double variance = 0, weight = pass ? pass / mean : 1, paths = 2 << pass; /* estimate: the floor's mean */
         for (int i = 0; i < SIZE * SIZE; ++i) {
             double sum = 0, square = 0;

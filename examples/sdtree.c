@@ -64,9 +64,9 @@ static float radiance(float *p, float *d, const gsd_view *field, gsd_stream *str
     const struct box *hit = trace(p, d, n);
     while (hit && !(hit->light > 0) && count < MAX_DEPTH) { // lamps do not reflect
         float jitter[3] = {rnd(), rnd(), rnd()}, u[2] = {rnd(), rnd()};
-        gsd_handle handle = gsd_find(field, p, jitter); // 1. Find the cell; jittered, which blends neighbours.
-        float alpha = stream ? handle.alpha : 1;        //    How often it wants the BSDF.
-        if (rnd() < alpha)                              // 2. One-sample MIS: draw from one of the two ...
+        gsd_handle handle = gsd_find(field, p, n, jitter); // 1. Find the cell; jittered, which blends neighbours.
+        float alpha = stream ? handle.alpha : 1;           //    How often it wants the BSDF.
+        if (rnd() < alpha)                                 // 2. One-sample MIS: draw from one of the two ...
             sample_cosine(n, d);
         else
             gsd_sample(field, &handle, u, d);
@@ -74,7 +74,8 @@ static float radiance(float *p, float *d, const gsd_view *field, gsd_stream *str
         float pdf_guide = alpha < 1 ? gsd_pdf(field, &handle, d) : 0;
         float pdf = alpha * pdf_bsdf + (1 - alpha) * pdf_guide; // ... and divide by the density of both.
         f_cos[count] = hit->grey / 3.14159265f * cosine;
-        vertex[count++] = gsd_make_scalar_sample(p, d, cosine > 0 ? 0 : GSD_REJECTED, 0, 0, pdf, pdf_bsdf, pdf_guide);
+        vertex[count++] =
+            gsd_make_scalar_sample(p, d, n, cosine > 0 ? 0 : GSD_REJECTED, 0, 0, pdf, pdf_bsdf, pdf_guide);
         hit = cosine > 0 ? trace(p, d, n) : NULL;
     }
     float L = hit ? hit->light : 0;

@@ -238,9 +238,10 @@ static void test_documented_defaults_are_the_defaults(void **state)
     const struct {
         const char *name;
         double value;
-    } fields[] = {{"switch_pass", d.switch_pass},
+    } fields[] = {{"switch_after", (double)d.switch_after},
                   {"split_samples", (double)d.split_samples},
                   {"rho", (double)d.rho},
+                  {"smoothing", (double)d.smoothing},
                   {"max_depth", d.max_depth},
                   {"max_levels", d.max_levels},
                   {"min_samples", d.min_samples},
@@ -347,9 +348,9 @@ static void test_sizes_are_as_documented(void **state)
     (void)state;
     assert_int_equal(sizeof(gsd_node), 16);
     assert_int_equal(sizeof(gsd_alias), 12);
-    assert_int_equal(sizeof(gsd_cell), 36);
-    assert_int_equal(sizeof(gsd_handle), 28);
-    assert_int_equal(sizeof(gsd_training_sample), 48);
+    assert_int_equal(sizeof(gsd_cell), 40);
+    assert_int_equal(sizeof(gsd_handle), 44);
+    assert_int_equal(sizeof(gsd_training_sample), 44);
     assert_int_equal(sizeof(gsdi_tree), 32);
     assert_true(sizeof(gsdi_state) < 600);
     assert_int_equal(sizeof(gsd_stats), 14 * 8 + 16 * 4);
@@ -648,12 +649,20 @@ static float scene_radiance(const float p[3], const float d[3])
     return d[0] > 0.9f ? 40 * (0.2f + p[1]) : d[2] > 0.5f ? 0.5f : 0.1f;
 }
 
+/* Component k of a sample's direction. */
+static float direction_of(const gsd_training_sample *s, int k)
+{
+    float d[3];
+    gsd_direction((s->direction[0] & 0xffffff) + 0.5, (s->direction[1] & 0xffffff) + 0.5, d);
+    return d[k];
+}
+
 /* n samples drawn from the field, as a renderer would; every 7th is black. */
 static void make_samples(const gsd_view *v, gsd_training_sample *s, uint32_t n)
 {
     for (uint32_t i = 0; i < n; ++i) {
         float p[3] = {rndf(), rndf(), rndf()}, d[3], u[2] = {rndf(), rndf()};
-        gsd_handle h = gsd_find(v, p, NULL);
+        gsd_handle h = gsd_find(v, p, NULL, NULL);
         float pg = gsd_sample(v, &h, u, d), pb = (float)(0.25 / PI);
         if (rnd() < (double)h.alpha) {
             random_direction(d);
@@ -661,7 +670,7 @@ static void make_samples(const gsd_view *v, gsd_training_sample *s, uint32_t n)
         }
         float mix = h.alpha * pb + (1 - h.alpha) * pg;
         float L = i % 7 ? scene_radiance(p, d) : 0;
-        s[i] = gsd_make_scalar_sample(p, d, L, L * 0.3f, L * 0.3f * (0.5f + p[0]), mix, pb, pg);
+        s[i] = gsd_make_scalar_sample(p, d, NULL, L, L * 0.3f, L * 0.3f * (0.5f + p[0]), mix, pb, pg);
     }
 }
 
@@ -773,7 +782,8 @@ static void test_targets_match_a_naive_reference(void **state)
         static double sum[2048];
         d.directional_filter = GSD_DIRECTIONAL_NEAREST;
         d.split_samples = 1e9f;
-        d.switch_pass = 2;
+        d.switch_after = 2;
+        d.smoothing = 0.001f;
         d.no_history = true;
         d.alpha_mode = GSD_ALPHA_FIXED;
         d.no_gate = true;
@@ -793,7 +803,8 @@ static void test_targets_match_a_naive_reference(void **state)
                 bool variance = target == GSD_TARGET_VARIANCE || (target == GSD_TARGET_SWITCHING && pass >= 2);
                 value = (double)(variance ? s[i].pixel_contribution : s[i].contribution) * w;
                 value = target == GSD_TARGET_RADIANCE ? (double)s[i].radiance : value * value;
-                naive_coordinates(s[i].direction, &x, &y);
+                x = ((s[i].direction[0] & 0xffffff) + 0.5) / 16777216;
+                y = ((s[i].direction[1] & 0xffffff) + 0.5) / 16777216;
                 naive_leaf(&t, x, y, &p, &area, &id);
                 sum[id] += value / (double)s[i].pdf_mix;
             }
@@ -814,10 +825,11 @@ static void test_targets_match_a_naive_reference(void **state)
             gsd_handle h = gsd_find_cell(&v, 0);
             long far = 0;
             for (int i = 0; i < 2000; ++i) { /* by direction */
-                naive_coordinates(s[i].direction, &x, &y);
+                x = ((s[i].direction[0] & 0xffffff) + 0.5) / 16777216;
+                y = ((s[i].direction[1] & 0xffffff) + 0.5) / 16777216;
                 naive_leaf(&now, x, y, &p, &area, &id);
                 double naive = (1 - e) * p / area + e / (4 * PI);
-                far += fabs((double)gsd_pdf(&v, &h, s[i].direction) - naive) > 2e-5 * naive;
+                far += fabs((double)gsd_pdf(&v, &h, (const float[]){direction_of(&s[i], 0), direction_of(&s[i], 1), direction_of(&s[i], 2)}) - naive) > 2e-5 * naive;
                 /* p itself, from the naive sums in the structure of the building tree */
                 double q;
                 naive_leaf(&t, x, y, &q, &area, &id);
@@ -907,7 +919,7 @@ static void test_trees_refine_where_the_mass_is(void **state)
     long hits = 0;
     for (int i = 0; i < 20000; ++i) {
         float p[3] = {rndf(), rndf(), rndf()}, u[2] = {rndf(), rndf()}, dir[3];
-        gsd_handle h = gsd_find(&v, p, NULL);
+        gsd_handle h = gsd_find(&v, p, NULL, NULL);
         gsd_sample(&v, &h, u, dir);
         hits += dir[0] > 0.9f;
     }
@@ -957,7 +969,7 @@ static void test_cells_split_where_samples_are(void **state)
     long far = 0;
     assert_true(v.cell_count > 200 && v.cell_count < 2000);
     for (int i = 0; i < 20000; ++i) {
-        gsd_handle h = gsd_find(&v, s[i].position, NULL);
+        gsd_handle h = gsd_find(&v, s[i].position, NULL, NULL);
         far += h.cell != naive_cell(&v, s[i].position);
         counts[h.cell]++;
     }
@@ -966,14 +978,14 @@ static void test_cells_split_where_samples_are(void **state)
         assert_true(counts[c] < 400);
     /* outside positions are clamped into the box, with u too */
     float outside[3] = {-1e30f, 1e30f, NAN}, u[3] = {0, 0.99f, 0.5f};
-    assert_true(gsd_find(&v, outside, NULL).cell < v.cell_count);
-    assert_true(gsd_find(&v, outside, u).cell < v.cell_count);
+    assert_true(gsd_find(&v, outside, NULL, NULL).cell < v.cell_count);
+    assert_true(gsd_find(&v, outside, NULL, u).cell < v.cell_count);
     /* batch */
     static gsd_handle handles[20000];
     static float alpha[20000];
-    gsd_find_batch(&v, 20000, NULL, s[0].position, sizeof s[0], NULL, 0, handles, alpha);
+    gsd_find_batch(&v, 20000, NULL, s[0].position, sizeof s[0], NULL, 0, NULL, 0, handles, alpha);
     for (int i = 0; i < 20000; ++i) {
-        gsd_handle h = gsd_find(&v, s[i].position, NULL);
+        gsd_handle h = gsd_find(&v, s[i].position, NULL, NULL);
         assert_memory_equal(&h, &handles[i], sizeof h);
         assert_true(alpha[i] == h.alpha);
     }
@@ -995,14 +1007,14 @@ static void test_thin_wall_lit_from_one_side(void **state)
         make_samples(&v, s, 30000);
         for (int i = 0; i < 30000; ++i) { /* points on z = 0.5, both sides; light only from above */
             s[i].position[2] = 0.5f;
-            s[i].radiance = s[i].direction[2] > 0 ? 1 : 0;
+            s[i].radiance = direction_of(&s[i], 2) > 0 ? 1 : 0;
         }
         learn(f, s, 30000);
         OK(gsd_refine(f, NULL, NULL, NULL));
     }
     gsd_view v = gsd_get_view(f);
     float p[3] = {0.4f, 0.6f, 0.5f}, down[3] = {0.1f, 0.1f, -0.9899495f}, up = 0;
-    gsd_handle h = gsd_find(&v, p, NULL);
+    gsd_handle h = gsd_find(&v, p, NULL, NULL);
     for (int i = 0; i < 10000; ++i) {
         float dir[3];
         random_direction(dir);
@@ -1040,7 +1052,7 @@ static void test_bad_samples_are_refused_and_leave_no_trace(void **state)
                 if (i % 100)
                     continue;
                 gsd_training_sample s = clean[(i + 77) % N];
-                float x = bad[(i / 100) % 6];
+                float x = bad[(i / 100) % 6], dir[3] = {0, 0, 1};
                 switch ((i / 100) % 11) {
                 case 0:
                     s.radiance = x;
@@ -1061,10 +1073,12 @@ static void test_bad_samples_are_refused_and_leave_no_trace(void **state)
                     s.pdf_guide = isfinite(x) ? -1 : x;
                     break;
                 case 6:
-                    s.direction[i / 100 % 3] = isfinite(x) ? NAN : x;
+                    dir[i / 100 % 3] = isfinite(x) ? NAN : x;
+                    s = gsd_make_scalar_sample(s.position, dir, NULL, 1, 1, 1, 1, 1, 0);
                     break;
                 case 7:
-                    memset(s.direction, 0, sizeof s.direction);
+                    memset(dir, 0, sizeof dir);
+                    s = gsd_make_scalar_sample(s.position, dir, NULL, 1, 1, 1, 1, 1, 0);
                     break;
                 case 8:
                     s.position[i / 100 % 3] = isfinite(x) ? NAN : x;
@@ -1104,7 +1118,7 @@ static void test_positions_outside_are_clamped_and_counted(void **state)
     gsd_field *f;
     float out[3] = {2, 0.5f, 0.5f}, dir[3] = {0, 0, 2};
     OK(gsd_create(&d, &f));
-    gsd_training_sample s = gsd_make_scalar_sample(out, dir, 1, 1, 1, 1, 1, 0);
+    gsd_training_sample s = gsd_make_scalar_sample(out, dir, NULL, 1, 1, 1, 1, 1, 0);
     learn(f, &s, 1);
     gsd_stats stats;
     gsd_get_stats(f, &stats);
@@ -1122,9 +1136,9 @@ static void test_rejected_and_zero_samples_count(void **state)
     float p[3] = {0.5f, 0.5f, 0.5f}, dir[3] = {0, 0, 1};
     gsd_training_sample s[3];
     OK(gsd_create(&d, &f));
-    s[0] = gsd_make_scalar_sample(p, dir, GSD_REJECTED, 5, 5, 1, 1, 0);
-    s[1] = gsd_make_scalar_sample(p, dir, 0, 0, 0, 1, 1, 0);
-    s[2] = gsd_make_scalar_sample(p, dir, 1, 1, 1, 1, 1, 0);
+    s[0] = gsd_make_scalar_sample(p, dir, NULL, GSD_REJECTED, 5, 5, 1, 1, 0);
+    s[1] = gsd_make_scalar_sample(p, dir, NULL, 0, 0, 0, 1, 1, 0);
+    s[2] = gsd_make_scalar_sample(p, dir, NULL, 1, 1, 1, 1, 1, 0);
     learn(f, s, 3);
     gsd_stats stats;
     gsd_get_stats(f, &stats);
@@ -1147,7 +1161,7 @@ static void test_rejected_and_zero_samples_count(void **state)
     OK(gsd_refine(f, NULL, NULL, NULL));
     OK(gsd_validate(f));
     gsd_view v = gsd_get_view(f);
-    gsd_handle h = gsd_find(&v, p, NULL);
+    gsd_handle h = gsd_find(&v, p, NULL, NULL);
     assert_true(fabsf(gsd_pdf(&v, &h, dir) - 0.0795775f) < 1e-6f && h.alpha == 1);
     gsd_destroy(f);
 }
@@ -1173,7 +1187,7 @@ static int scenario(counter *c)
     for (int i = 0; i < 3000; ++i) {
         float p[3] = {0.5f, 0.5f, 0.5f}, dir[3];
         random_direction(dir);
-        s[i] = gsd_make_scalar_sample(p, dir, 1, dir[0] > 0.8f ? 1 : 0.1f, 1, 0.0795775f, 0.0795775f, 0);
+        s[i] = gsd_make_scalar_sample(p, dir, NULL, 1, dir[0] > 0.8f ? 1 : 0.1f, 1, 0.0795775f, 0.0795775f, 0);
         cells[i] = (uint32_t)i % 3;
     }
     failed += gsd_stream_create(f, &stream) != GSD_OK;
@@ -1267,7 +1281,7 @@ static void test_queries_do_not_allocate(void **state)
     gsd_view v = gsd_get_view(f);
     float p[3] = {0.1f, 0.2f, 0.3f}, u[2] = {0.3f, 0.4f}, dir[3], pdf;
     gsd_handle h;
-    gsd_find_batch(&v, 1, NULL, p, 12, NULL, 0, &h, NULL);
+    gsd_find_batch(&v, 1, NULL, p, 12, NULL, 0, NULL, 0, &h, NULL);
     gsd_sample_batch(&v, 1, NULL, &h, u, 8, dir, 12, &pdf);
     gsd_pdf_batch(&v, 1, NULL, &h, dir, 12, &pdf);
     OK(gsd_validate(f));
@@ -1333,7 +1347,7 @@ static gsd_stats gate_after(bool peaked, double light_probability, int passes, g
         gsd_view v = gsd_get_view(f);
         make_samples(&v, s, n);
         for (uint32_t i = 0; i < n; ++i) {
-            float L = peaked ? (s[i].direction[0] > 0.97f ? 100 : 0.01f) : 1 + 0.1f * s[i].direction[2];
+            float L = peaked ? (direction_of(&s[i], 0) > 0.97f ? 100 : 0.01f) : 1 + 0.1f * direction_of(&s[i], 2);
             L = rnd() < light_probability ? L : 0;
             s[i].radiance = s[i].contribution = s[i].pixel_contribution = L;
         }
@@ -1361,7 +1375,7 @@ static void test_gate_closes_where_light_is_even(void **state)
     assert_true(gsd_record_fraction(f) < 0.15f);
     gsd_view v = gsd_get_view(f);
     float p[3] = {0.2f, 0.3f, 0.4f};
-    gsd_handle h = gsd_find(&v, p, NULL);
+    gsd_handle h = gsd_find(&v, p, NULL, NULL);
     assert_true(h.alpha == 1);
     gsd_destroy(f);
 }
@@ -1419,7 +1433,7 @@ static void test_gate_weighs_by_pixels(void **state)
     for (int dark = 0; dark < 2; ++dark) {
         gsd_desc d = unit_cube(GSD_TARGET_SIMPLE);
         gsd_field *f;
-        gsd_pass info = {0, true};
+        gsd_pass info = {true};
         gsd_stats stats;
         static gsd_training_sample s[40000];
         seed(6);
@@ -1428,7 +1442,7 @@ static void test_gate_weighs_by_pixels(void **state)
             gsd_view v = gsd_get_view(f);
             make_samples(&v, s, 40000);
             for (int i = 0; i < 40000; ++i) {
-                s[i].radiance = s[i].contribution = s[i].direction[0] > 0.97f ? 100 : 0.01f;
+                s[i].radiance = s[i].contribution = direction_of(&s[i], 0) > 0.97f ? 100 : 0.01f;
                 s[i].pixel_contribution = s[i].contribution * (dark ? 1 : 1e-4f);
             }
             learn(f, s, 40000);
@@ -1455,7 +1469,7 @@ static void test_closed_cells_are_tried_again(void **state)
         gsd_view v = gsd_get_view(f);
         make_samples(&v, s, 60000);
         for (int i = 0; i < 60000; ++i) {
-            float L = s[i].direction[0] > 0.97f ? 100 : 0.01f;
+            float L = direction_of(&s[i], 0) > 0.97f ? 100 : 0.01f;
             s[i].radiance = s[i].contribution = s[i].pixel_contribution = L;
         }
         learn(f, s, 60000);
@@ -1501,8 +1515,8 @@ static void test_unread_and_waiting_cells_are_left_alone(void **state)
     gsd_view v = gsd_get_view(f);
     gsd_tree far_before = {0}, far_after;
     float far[3] = {0.9f, 0.9f, 0.9f}, near[3] = {0.01f, 0.01f, 0.01f};
-    uint32_t cell = gsd_find(&v, far, NULL).cell;
-    assert_true(cell != gsd_find(&v, near, NULL).cell);
+    uint32_t cell = gsd_find(&v, far, NULL, NULL).cell;
+    assert_true(cell != gsd_find(&v, near, NULL, NULL).cell);
     far_before = export(f, GSD_PART_SAMPLING, cell);
     make_samples(&v, s, 4000);
     for (int i = 0; i < 4000; ++i)
@@ -1554,7 +1568,7 @@ static void test_forest_split_export_and_import(void **state)
     for (int i = 0; i < 500; ++i) {
         float p[3] = {0, 0, 0}, d[3];
         random_direction(d);
-        s[i] = gsd_make_scalar_sample(p, d, 1 + 10 * (d[0] > 0.5f), 1, 1, 0.0795775f, 0.0795775f, 0);
+        s[i] = gsd_make_scalar_sample(p, d, NULL, 1 + 10 * (d[0] > 0.5f), 1, 1, 0.0795775f, 0.0795775f, 0);
         cells[i] = 7;
     }
     cells[0] = 8; /* no such cell: refused */
@@ -1735,7 +1749,7 @@ static void test_merge_equals_training_together(void **state)
     for (int i = 0; i < 5000; ++i) {
         float dir[3], p[3] = {rndf(), rndf(), rndf()};
         random_direction(dir);
-        gsd_handle ha = gsd_find(&va, p, NULL), hb = gsd_find(&vb, p, NULL);
+        gsd_handle ha = gsd_find(&va, p, NULL, NULL), hb = gsd_find(&vb, p, NULL, NULL);
         float pa = gsd_pdf(&va, &ha, dir), pb = gsd_pdf(&vb, &hb, dir);
         assert_true(fabsf(pa - pb) <= 1e-5f * pb);
     }

@@ -412,7 +412,6 @@ static void query_pdf(tr_worker *w, const tr_frame *frame, int n)
 
 static void sample_lights(tr_worker *w, const tr_frame *frame)
 {
-    int guided = 0;
     for (int k = 0; k < w->smooth_count; ++k) {
         int id = w->smooth[k];
         path *p = &w->paths[id];
@@ -425,16 +424,9 @@ static void sample_lights(tr_worker *w, const tr_frame *frame)
             continue;
         }
         w->light_f[k] = tr_closure_eval(&w->closures[id], l->wi, &w->light_pdf_bsdf[k]);
-        if (black3(w->light_f[k])) {
+        if (black3(w->light_f[k]))
             l->pdf = 0;
-            continue;
-        }
-        if (w->alpha[k] < 1 && !l->delta) {
-            w->wi[k] = l->wi;
-            w->index[guided++] = k;
-        }
     }
-    query_pdf(w, frame, guided);
 }
 
 /* The mixture's density: what one-sample MIS drew from. */
@@ -446,6 +438,7 @@ static float mixture(const tr_closure *c, float alpha, float pdf_bsdf, float pdf
 
 static void next_event(tr_worker *w, const tr_frame *frame, bool recording)
 {
+    int guided = 0;
     sample_lights(w, frame);
     double start = tr_wall_seconds();
     for (int k = 0; k < w->smooth_count; ++k) {
@@ -464,6 +457,12 @@ static void next_event(tr_worker *w, const tr_frame *frame, bool recording)
         w->counters.shadow_rays++;
     }
     w->counters.trace += tr_wall_seconds() - start;
+    for (int k = 0; k < w->smooth_count; ++k) /* what is in the shadow needs no weight */
+        if (w->lights[k].pdf > 0 && w->alpha[k] < 1 && !w->lights[k].delta) {
+            w->wi[k] = w->lights[k].wi;
+            w->index[guided++] = k;
+        }
+    query_pdf(w, frame, guided);
     for (int k = 0; k < w->smooth_count; ++k) {
         const tr_light_sample *l = &w->lights[k];
         if (!(l->pdf > 0))
