@@ -201,11 +201,11 @@ typedef struct gsd_desc {
     float bounds_min[3], bounds_max[3]; /* world-space box of the positions; made a cube and 0.1 % larger */
     gsd_target target;
     float switch_after;   /* first passes' worth of samples before variance-aware, 0.001 .. 1e6; default 4 */
-    float split_samples;  /* c, samples a cell holds before it splits, 16 .. 1e9; default 1000 */
+    float split_samples;  /* c, see HOW IT WORKS, 16 .. 1e9; default 0: the threshold follows the samples */
     float rho;            /* share of a quadtree's mass above which a node is divided, 1e-5 .. 1; default 0.01 */
     uint32_t max_depth;   /* of quadtrees, 1 .. 20; default 16 */
     uint32_t max_levels;  /* of the spatial tree (3 levels halve all axes), 1 .. 60; default 48 */
-    uint32_t min_samples; /* a cell with fewer new samples waits for more before its tree is rebuilt; default 64 */
+    uint32_t min_samples; /* a cell with fewer new samples waits for more before its tree is rebuilt; default 16 */
     uint64_t max_bytes;   /* memory cap, see MEMORY; >= 65536; default 2^30 */
     gsd_spatial_filter spatial_filter;
     gsd_directional_filter directional_filter;
@@ -887,9 +887,6 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 
 #define GSDI_NONE 0xffffffffu
 #define GSDI_GRID 4096u       /* 16^3 links */
-#ifndef GSDI_HALF
-#define GSDI_HALF 0.5
-#endif
 #define GSDI_BINS 64u         /* 8 x 8 bins of directions: nodes of depth 3 */
 #define GSDI_ROUND (1u << 18) /* samples sorted at once */
 #define GSDI_SEGMENT 2048u    /* samples prepared at once */
@@ -906,6 +903,8 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_ENOUGH_HITS 256u     /* non-zero samples of a cell and pass; from then on the gate takes one of eight */
 #define GSDI_REFLECTED_SAMPLES 32 /* of a cell and pass, for its mean reflected radiance to count */
 #define GSDI_MIN_REBUILDS 3       /* before that verdict: the first trees are noise */
+#define GSDI_SPLIT 2.0            /* a cell splits above that times sqrt(samples held): tuned on SF1 (1 .. 2), ajar */
+#define GSDI_MIN_SPLIT 32.0       /* at least */
 #define GSDI_MAX_CELLS (1u << 26)
 
 /* ---- >>memory ----------------------------------------------------------------------------------------------- */
@@ -2489,8 +2488,11 @@ static void gsdi_pass_scale(gsdi_refinement *r, double samples)
         growth = samples / field->last_pass_samples;
     growth = growth > 1 ? growth < 2 ? growth : 2 : 1;
     r->fade = growth < 1.05 ? 0.95 : 1 / growth;
-    r->split = (double)r->desc->split_samples * sqrt(first > 0 && held > first ? held / first : 1);
-    r->keep = held > 0 ? GSDI_HALF * (all - growth * samples) / held : 0;
+    if (r->desc->split_samples > 0)
+        r->split = (double)r->desc->split_samples * sqrt(first > 0 && held > first ? held / first : 1);
+    else
+        r->split = fmax(GSDI_MIN_SPLIT, GSDI_SPLIT * sqrt(held));
+    r->keep = held > 0 ? 0.5 * (all - growth * samples) / held : 0;
     r->keep = r->desc->no_history || r->keep < 0 ? 0 : r->keep < 1 ? r->keep : 1;
     r->target = (gsd_target)field->target;
     if (r->desc->target == GSD_TARGET_SWITCHING && all >= (double)r->desc->switch_after * first)
@@ -2727,12 +2729,11 @@ GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
     d.directional_filter = d.directional_filter ? d.directional_filter : GSD_DIRECTIONAL_BOX;
     d.alpha_mode = d.alpha_mode ? d.alpha_mode : GSD_ALPHA_GRID;
     gsdi_default_float(&d.switch_after, 4);
-    gsdi_default_float(&d.split_samples, 1000);
     gsdi_default_float(&d.rho, 0.01f);
     gsdi_default_float(&d.smoothing, 3);
     gsdi_default_u32(&d.max_depth, 16);
     gsdi_default_u32(&d.max_levels, 48);
-    gsdi_default_u32(&d.min_samples, 64);
+    gsdi_default_u32(&d.min_samples, 16);
     d.max_bytes = d.max_bytes ? d.max_bytes : (uint64_t)1 << 30;
     gsdi_default_float(&d.alpha, 0.5f);
     gsdi_default_float(&d.uniform, 0.01f);
@@ -2747,7 +2748,7 @@ GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
     if (d.simd == GSD_SIMD_AUTO)
         return GSD_BAD_OPTION;
     if (!gsdi_within((double)d.switch_after, 0.99e-3, 1e6) || !gsdi_within((double)d.smoothing, 0.99e-3, 1000) ||
-        !gsdi_within((double)d.split_samples, 16, 1e9) ||
+        (d.split_samples != 0 && !gsdi_within((double)d.split_samples, 16, 1e9)) ||
         !gsdi_within((double)d.rho, 0.99e-5, 1) || !gsdi_within(d.max_depth, 1, 20) ||
         !gsdi_within(d.max_levels, 1, 60) || !gsdi_within((double)d.alpha, 0.0499, 1) ||
         !gsdi_within((double)d.uniform, 0.99e-4, 1) || !gsdi_within((double)d.gate_margin, 0.99e-3, 10) ||

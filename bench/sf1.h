@@ -187,8 +187,9 @@ static inline int sf1_draw(sf1_rng *rng, int update, int exact_weights, sf1_samp
 
 /* ---- >>score ------------------------------------------------------------------------------------------------ */
 
-/* Density per sr that the method would use at this point for this direction. */
-typedef double (*sf1_pdf_fn)(void *user, const sf1_point *point, const double *direction);
+/* Density per sr that the method would use at this point for this direction; cosine: with the surface's cosine
+   multiplied in, where the method can do that. */
+typedef double (*sf1_pdf_fn)(void *user, const sf1_point *point, const double *direction, int cosine);
 
 typedef struct sf1_score {
     double a; /* h = L, p = the guide alone */
@@ -213,11 +214,11 @@ static inline sf1_score sf1_evaluate(sf1_pdf_fn pdf, void *user, uint64_t seed, 
             if (cosine <= 0)
                 continue;
             double q = 0.8 * sf1_lobes_pdf(&p, w) + 0.2 / (2 * SF1_PI), L = sf1_radiance(&p, w, 0);
-            double guide = fmax(pdf(user, &p, w), 1e-6);
+            double guide = fmax(pdf(user, &p, w, 0), 1e-6), product = pdf(user, &p, w, 1);
             ha += L / q;
             va += L * L / (guide * q);
             hc += L * cosine / q;
-            vc += L * cosine * L * cosine / ((0.5 * cosine / SF1_PI + 0.5 * guide) * q);
+            vc += L * cosine * L * cosine / ((0.5 * cosine / SF1_PI + 0.5 * product) * q);
         }
         mean.a += va * directions / (ha * ha) / points;
         mean.c += vc * directions / (hc * hc) / points;

@@ -158,25 +158,28 @@ static void free_tree(gsd_tree *t)
     free(t->value);
 }
 
-/* A forest with one imported tree per cell. */
-static gsd_field *forest_of(uint32_t cells, uint32_t inner, uint32_t max_depth, bool alias, gsd_simd simd)
+/* A forest with one imported tree per cell; frees the trees. */
+static gsd_field *forest_of_trees(gsd_tree *trees, uint32_t cells, gsd_desc d)
 {
-    gsd_desc d = {0};
     gsd_field *field;
     d.forest_cells = cells;
-    d.max_depth = max_depth;
-    d.alias = alias;
-    d.simd = simd;
     d.max_bytes = (uint64_t)1 << 32;
     OK(gsd_create(&d, &field));
-    gsd_tree *trees = calloc(cells, sizeof *trees);
-    for (uint32_t c = 0; c < cells; ++c)
-        trees[c] = random_tree(c, inner, max_depth);
     OK(gsd_import_trees(field, trees, cells));
     for (uint32_t c = 0; c < cells; ++c)
         free_tree(&trees[c]);
-    free(trees);
     OK(gsd_validate(field));
+    return field;
+}
+
+static gsd_field *forest_of(uint32_t cells, uint32_t inner, uint32_t max_depth, bool alias, gsd_simd simd)
+{
+    gsd_desc d = {.max_depth = max_depth, .alias = alias, .simd = simd};
+    gsd_tree *trees = calloc(cells, sizeof *trees);
+    for (uint32_t c = 0; c < cells; ++c)
+        trees[c] = random_tree(c, inner, max_depth);
+    gsd_field *field = forest_of_trees(trees, cells, d);
+    free(trees);
     return field;
 }
 
@@ -593,6 +596,482 @@ static void test_seam_poles_and_odd_directions(void **state)
     assert_true(worst < 1.5 / 16777216.0);
 }
 
+/* ---- the cosine: gsd_orient */
+
+/* A leaf of an exported tree: lowest corner in 24-bit coordinates; id as naive_leaf gives it. */
+typedef struct leaf {
+    uint32_t x, y, depth, id;
+    double probability;
+} leaf;
+
+static leaf *leaves_of(const gsd_tree *t, uint32_t *count)
+{
+    leaf *inner = calloc(t->count, sizeof *inner), *out = calloc(3 * t->count + 1, sizeof *out);
+    *count = 0;
+    for (uint32_t i = 0; i < t->count; ++i)
+        for (uint32_t k = 0; k < 4; ++k) {
+            uint32_t half = 8388608u >> inner[i].depth, c = t->child[i * 4 + k];
+            leaf l = {inner[i].x + (k & 1) * half, inner[i].y + (k >> 1) * half, inner[i].depth + 1, i * 4 + k,
+                      (double)t->value[i * 4 + k]};
+            if (c)
+                inner[c] = l;
+            else
+                out[(*count)++] = l;
+        }
+    free(inner);
+    return out;
+}
+
+/* Where the density is constant: a leaf, or the part of a large leaf in one of the 8 x 8 bins. d: a direction in its
+   middle, at (x, y) in [0, 1)^2. */
+typedef struct part {
+    uint32_t id, bin;
+    double x, y, size, probability;
+    float d[3];
+} part;
+
+static part *parts_of(const gsd_tree *t, uint32_t *count)
+{
+    uint32_t leaves;
+    leaf *l = leaves_of(t, &leaves);
+    part *out = calloc(leaves + 64, sizeof *out);
+    *count = 0;
+    for (uint32_t i = 0; i < leaves; ++i) {
+        uint32_t n = l[i].depth < 3 ? 8u >> l[i].depth : 1;
+        for (uint32_t k = 0; k < n * n; ++k) {
+            part *p = &out[(*count)++];
+            p->size = pow(0.5, l[i].depth) / n;
+            p->x = l[i].x / 16777216.0 + p->size * (k % n + 0.5);
+            p->y = l[i].y / 16777216.0 + p->size * (k / n + 0.5);
+            p->id = l[i].id;
+            p->bin = (uint32_t)(p->y * 8) * 8 + (uint32_t)(p->x * 8);
+            p->probability = l[i].probability / (n * n);
+            double z = 2 * p->y - 1, r = sqrt((1 - z) * (1 + z));
+            p->d[0] = (float)(r * cos(2 * PI * p->x));
+            p->d[1] = (float)(r * sin(2 * PI * p->x));
+            p->d[2] = (float)z;
+        }
+    }
+    free(l);
+    return out;
+}
+
+/* The cosine that a bin counts with, from its definition: the mean of the bin's directions as a sum over many. */
+static double naive_cosine(const double n[3], uint32_t bin)
+{
+    static double mean[64][3];
+    const double h = (double)GSD_HORIZON, below = (double)GSD_BELOW;
+    if (mean[0][2] == 0)
+        for (uint32_t b = 0; b < 64; ++b) {
+            double r = 0, c = 0, s = 0;
+            enum { POINTS = 1 << 16 };
+            for (int i = 0; i < POINTS; ++i) {
+                double z = (b / 8 + (i + 0.5) / POINTS) / 4 - 1, phi = (b % 8 + (i + 0.5) / POINTS) * PI / 4;
+                r += sqrt(1 - z * z) / POINTS;
+                c += cos(phi) / POINTS;
+                s += sin(phi) / POINTS;
+            }
+            mean[b][0] = r * c;
+            mean[b][1] = r * s;
+            mean[b][2] = (b / 8 + 0.5) / 4 - 1;
+        }
+    double t = n[0] * mean[bin][0] + n[1] * mean[bin][1] + n[2] * mean[bin][2];
+    return below + (t < -h ? 0 : t > h ? t : (t + h) * (t + h) / (4 * h));
+}
+
+/* A cell's learned density in double precision, to be multiplied by the cosine to any normal. */
+typedef struct reference {
+    gsd_tree tree;
+    double e, mass[64];
+} reference;
+
+static reference reference_of(const gsd_field *f, uint32_t cell)
+{
+    reference r = {export(f, GSD_PART_SAMPLING, cell), (double)gsd_get_desc(f)->uniform, {0}};
+    uint32_t count;
+    part *p = parts_of(&r.tree, &count);
+    for (uint32_t i = 0; i < count; ++i)
+        r.mass[p[i].bin] += p[i].probability;
+    free(p);
+    return r;
+}
+
+static double reference_mean_cosine(const reference *r, const double n[3])
+{
+    double mean = 0;
+    for (uint32_t k = 0; k < 64; ++k)
+        mean += r->mass[k] * naive_cosine(n, k);
+    return mean;
+}
+
+/* At (x, y) in [0, 1)^2. */
+static double reference_pdf(const reference *r, const double n[3], double x, double y)
+{
+    double p, area;
+    uint32_t id, bin = (uint32_t)(y * 8) * 8 + (uint32_t)(x * 8);
+    naive_leaf(&r->tree, x, y, &p, &area, &id);
+    return (1 - r->e) * p / area * naive_cosine(n, bin) / reference_mean_cosine(r, n) + r->e / (4 * PI);
+}
+
+/* Axes first: poles, seam and bins' edges; then any. */
+static void some_normal(unsigned k, float n[3])
+{
+    random_direction(n);
+    if (k < 6)
+        for (unsigned i = 0; i < 3; ++i)
+            n[i] = i != k / 2 ? 0 : k % 2 ? -1.0f : 1.0f;
+}
+
+/* Trees of all kinds: leaves as large as a quarter of the sphere, all of them or beside small ones. */
+static gsd_field *oriented_forest(unsigned kind, uint64_t s, gsd_desc d)
+{
+    const uint32_t depth[] = {1, 2, 2, 3, 4, 20, 20, 9, 12, 16, 20, 20};
+    const uint32_t inner[] = {1, 3, 5, 12, 30, 2, 19, 200, 60, 300, 300, 900};
+    seed(100 * kind + s);
+    gsd_tree t = random_tree(0, inner[kind], depth[kind]);
+    d.max_depth = depth[kind];
+    return forest_of_trees(&t, 1, d);
+}
+enum { TREE_KINDS = 12 };
+
+static void test_oriented_density_integrates_to_one(void **state)
+{
+    (void)state;
+    for (unsigned kind = 0; kind < TREE_KINDS; ++kind)
+        for (unsigned round = 0; round < 4; ++round) {
+            gsd_field *f = oriented_forest(kind, round, (gsd_desc){.uniform = round % 2 ? 0 : 1e-4f});
+            gsd_view v = gsd_get_view(f);
+            gsd_tree t = export(f, GSD_PART_SAMPLING, 0);
+            uint32_t count;
+            part *p = parts_of(&t, &count);
+            for (unsigned k = 0; k < 14; ++k) {
+                gsd_handle h = gsd_find_cell(&v, 0);
+                float n[3];
+                double total = 0, low = 1;
+                some_normal(k, n);
+                gsd_orient(&v, &h, n);
+                assert_true(h.product > 0 && h.alpha == 0.5f);
+                for (uint32_t i = 0; i < count; ++i) {
+                    double pdf = (double)gsd_pdf(&v, &h, p[i].d);
+                    total += pdf * 4 * PI * p[i].size * p[i].size;
+                    low = fmin(low, pdf);
+                }
+                if (fabs(total - 1) > 1e-5)
+                    fail_msg("integral 1 %+g, kind %u round %u normal %u", total - 1, kind, round, k);
+                assert_true(low > 0.99 * (double)v.uniform / (4 * PI));
+            }
+            free(p);
+            free_tree(&t);
+            gsd_destroy(f);
+        }
+}
+
+static void test_oriented_density_matches_a_naive_reference(void **state)
+{
+    (void)state;
+    for (unsigned kind = 0; kind < TREE_KINDS; ++kind)
+        for (unsigned round = 0; round < 4; ++round) {
+            const float uniform[] = {0.01f, 1e-4f, 0.5f, 1};
+            gsd_field *f = oriented_forest(kind, 50 + round, (gsd_desc){.uniform = uniform[round]});
+            gsd_view v = gsd_get_view(f);
+            reference r = reference_of(f, 0);
+            uint32_t count;
+            part *p = parts_of(&r.tree, &count);
+            if (round == 3) /* what is learned cannot be exported from beneath a share of 1 */
+                assert_true(r.mass[0] == 0);
+            for (unsigned k = 0; k < 10; ++k) {
+                gsd_handle h = gsd_find_cell(&v, 0);
+                float n[3];
+                some_normal(k, n);
+                gsd_orient(&v, &h, n);
+                const double wide[3] = {(double)n[0], (double)n[1], (double)n[2]};
+                for (uint32_t i = 0; i < count; i += 1 + count / 300) {
+                    double pdf = (double)gsd_pdf(&v, &h, p[i].d);
+                    double naive = round == 3 ? 1 / (4 * PI) : reference_pdf(&r, wide, p[i].x, p[i].y);
+                    if (fabs(pdf - naive) > 2e-5 * naive)
+                        fail_msg("%g, expected %g: kind %u round %u normal %u", pdf, naive, kind, round, k);
+                }
+            }
+            free(p);
+            free_tree(&r.tree);
+            gsd_destroy(f);
+        }
+}
+
+/* Chi-square of draws against the reference, on quarters of all parts. */
+static void oriented_chi_square(unsigned kind, unsigned normal, bool alias, bool batch)
+{
+    enum { BLOCK = 1000 };
+    gsd_field *f = oriented_forest(kind, 9, (gsd_desc){.alias = alias});
+    gsd_view v = gsd_get_view(f);
+    gsd_handle handles[BLOCK];
+    reference r = reference_of(f, 0);
+    uint32_t count;
+    part *p = parts_of(&r.tree, &count);
+    uint32_t slots = r.tree.count * 4 * 64 * 4;
+    double *expected = calloc(slots, sizeof *expected), rest = 0, rest_seen = 0, chi2 = 0, df = -1;
+    long *seen = calloc(slots, sizeof *seen), n = scaled(200000);
+    static float u[BLOCK][2], d[BLOCK][3], pdf[BLOCK], axis[3];
+    some_normal(normal, axis);
+    const double wide[3] = {(double)axis[0], (double)axis[1], (double)axis[2]};
+    for (int i = 0; i < BLOCK; ++i) {
+        handles[i] = gsd_find_cell(&v, 0);
+        gsd_orient(&v, &handles[i], axis);
+    }
+    for (uint32_t i = 0; i < count; ++i)
+        for (uint32_t k = 0; k < 4; ++k)
+            expected[(p[i].id * 64 + p[i].bin) * 4 + k] =
+                (double)n * reference_pdf(&r, wide, p[i].x, p[i].y) * PI * p[i].size * p[i].size;
+    for (long at = 0; at < n; at += BLOCK) {
+        for (int i = 0; i < BLOCK; ++i) {
+            u[i][0] = rndf();
+            u[i][1] = rndf();
+        }
+        if (batch)
+            gsd_sample_batch(&v, BLOCK, NULL, handles, u[0], sizeof u[0], d[0], sizeof d[0], pdf);
+        for (int i = 0; i < BLOCK; ++i) {
+            double x, y, probability, area;
+            uint32_t id;
+            if (!batch)
+                gsd_sample(&v, &handles[i], u[i], d[i]);
+            naive_coordinates(d[i], &x, &y);
+            naive_leaf(&r.tree, x, y, &probability, &area, &id);
+            double side = fmin(sqrt(area / (4 * PI)), 0.125);
+            uint32_t quarter = (uint32_t)(x / side * 2) % 2 + (uint32_t)(y / side * 2) % 2 * 2;
+            seen[(id * 64 + (uint32_t)(y * 8) * 8 + (uint32_t)(x * 8)) * 4 + quarter]++;
+        }
+    }
+    for (uint32_t i = 0; i < slots; ++i) {
+        assert_true(expected[i] > 0 || seen[i] == 0);
+        if (expected[i] < 20) {
+            rest += expected[i];
+            rest_seen += (double)seen[i];
+            continue;
+        }
+        chi2 += ((double)seen[i] - expected[i]) * ((double)seen[i] - expected[i]) / expected[i];
+        df += 1;
+    }
+    if (rest > 5) {
+        chi2 += (rest_seen - rest) * (rest_seen - rest) / rest;
+        df += 1;
+    }
+    assert_true(df >= 15);
+    if (chi_square_deviate(chi2, df) > 4)
+        fail_msg("chi-square %g at %g degrees of freedom (kind %u, normal %u, alias %d, batch %d)", chi2, df, kind,
+                 normal, alias, batch);
+    free(expected);
+    free(seen);
+    free(p);
+    free_tree(&r.tree);
+    gsd_destroy(f);
+}
+
+static void test_oriented_samples_follow_the_density(void **state)
+{
+    (void)state;
+    for (unsigned kind = 0; kind < 9; ++kind)
+        oriented_chi_square(kind, kind % 2 ? 20 : kind % 6, kind % 3 == 1, false);
+}
+
+static void test_oriented_batches_follow_the_density(void **state)
+{
+    (void)state;
+    for (unsigned kind = 0; kind < 9; ++kind)
+        oriented_chi_square(kind, kind % 2 ? kind % 6 : 20, kind % 3 == 1, true);
+}
+
+/* As without a normal: the pdf that sample returns is that of the rounded direction. */
+static void test_oriented_sample_and_pdf_agree(void **state)
+{
+    (void)state;
+    for (unsigned kind = 0; kind < TREE_KINDS; ++kind) {
+        gsd_field *f = oriented_forest(kind, 3, (gsd_desc){.alias = kind % 2});
+        gsd_view v = gsd_get_view(f);
+        reference r = reference_of(f, 0);
+        long n = scaled(10000), other = 0, batch_other = 0;
+        for (long i = 0; i < n; ++i) {
+            gsd_handle h = gsd_find_cell(&v, 0);
+            float axis[3], u[2] = {rndf(), rndf()}, d[3], again[3], pdf, batch_pdf;
+            double x, y;
+            some_normal((unsigned)i % 20, axis);
+            gsd_orient(&v, &h, axis);
+            const double wide[3] = {(double)axis[0], (double)axis[1], (double)axis[2]};
+            pdf = gsd_sample(&v, &h, u, d);
+            assert_true(pdf == gsd_pdf(&v, &h, d));
+            gsd_sample_batch(&v, 1, NULL, &h, u, sizeof u, again, sizeof again, &batch_pdf);
+            batch_other += batch_pdf != gsd_pdf(&v, &h, again);
+            naive_coordinates(d, &x, &y);
+            double naive = reference_pdf(&r, wide, x, y);
+            other += fabs((double)pdf - naive) > 1e-4 * naive;
+        }
+        assert_true((double)other / (double)n < (kind == 10 || kind == 11 ? 0.05 : 0.001));
+        assert_true(batch_other <= 1);
+        free_tree(&r.tree);
+        gsd_destroy(f);
+    }
+}
+
+/* Cells of a forest are oriented one by one; what does not guide, or is no cell, stays as it is. */
+static void test_cells_of_a_forest_are_oriented(void **state)
+{
+    (void)state;
+    enum { CELLS = 12 };
+    gsd_tree trees[CELLS];
+    seed(21);
+    for (uint32_t c = 0; c < CELLS; ++c)
+        trees[c] = random_tree(c, 1 + 7 * c, c % 3 ? 9 : 2);
+    memset(trees[4].value, 0, trees[4].count * 16); /* uniform */
+    gsd_field *f = forest_of_trees(trees, CELLS, (gsd_desc){.max_depth = 9});
+    gsd_view v = gsd_get_view(f);
+    for (uint32_t c = 0; c < CELLS + 2; ++c)
+        for (unsigned k = 0; k < 8; ++k) {
+            gsd_handle plain = gsd_find_cell(&v, c), h = plain;
+            float n[3];
+            some_normal(k, n);
+            gsd_orient(&v, &h, n);
+            if (c == 4 || c >= CELLS) {
+                assert_memory_equal(&h, &plain, sizeof h);
+                continue;
+            }
+            assert_memory_equal(h.normal, n, sizeof n);
+            memset(h.normal, 0, sizeof n);
+            h.product = 0;
+            assert_memory_equal(&h, &plain, sizeof h); /* nothing else has changed */
+            gsd_orient(&v, &h, n);
+            reference r = reference_of(f, c);
+            const double wide[3] = {(double)n[0], (double)n[1], (double)n[2]};
+            uint32_t count;
+            part *p = parts_of(&r.tree, &count);
+            for (uint32_t i = 0; i < count; i += 7) {
+                double naive = reference_pdf(&r, wide, p[i].x, p[i].y);
+                assert_true(fabs((double)gsd_pdf(&v, &h, p[i].d) - naive) <= 2e-5 * naive);
+            }
+            free(p);
+            free_tree(&r.tree);
+        }
+    gsd_destroy(f);
+    /* alpha = 1: nobody draws from the guide */
+    seed(22);
+    trees[0] = random_tree(0, 20, 9);
+    f = forest_of_trees(trees, 1, (gsd_desc){.alpha = 1});
+    v = gsd_get_view(f);
+    gsd_handle plain = gsd_find_cell(&v, 0), h = plain;
+    gsd_orient(&v, &h, (const float[3]){0, 0, 1});
+    assert_memory_equal(&h, &plain, sizeof h);
+    gsd_destroy(f);
+}
+
+/* Whether this machine has the level. */
+static bool have_level(int level)
+{
+    gsd_desc probe = unit_cube(GSD_TARGET_RADIANCE), resolved;
+    probe.simd = (gsd_simd)level;
+    return gsd_resolve(&probe, &resolved) == GSD_OK;
+}
+
+/* Normals that are none leave the density as it is; those far from unit length spoil nothing. */
+static void test_odd_normals_do_no_harm(void **state)
+{
+    (void)state;
+    const float i = INFINITY;
+    const float plain_normals[][3] = {{0, 0, 0},       {NAN, 0, 0},    {0, NAN, 1},       {0.6f, 0.8f, NAN},
+                                      {NAN, NAN, NAN}, {1e-20f, 0, 0}, {-0.0f, 0, 0},     {i, 0, 0},
+                                      {0, -i, 0},      {0, 0, i},      {i, -i, 0},        {i, i, i},
+                                      {-i, -i, -i},    {i, NAN, 0.5f}, {0.3f, 0.3f, 0.3f}};
+    const float long_normals[][3] = {{2, 0, 0},          {0, -1e5f, 1e5f}, {1e18f, 0, 0},
+                                     {1e30f, -1e30f, 0}, {0, 0, 3e38f},    {3e38f, 3e38f, 3e38f}};
+    enum { PLAIN = sizeof plain_normals / sizeof *plain_normals, LONG = sizeof long_normals / sizeof *long_normals };
+    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_AVX512; ++level)
+        for (unsigned kind = 0; have_level(level) && kind < TREE_KINDS; kind += 2) {
+            gsd_field *f = oriented_forest(kind, 1, (gsd_desc){.simd = (gsd_simd)level, .alias = kind % 4 == 0});
+            gsd_view v = gsd_get_view(f);
+            gsd_handle found[PLAIN + LONG];
+            float normals[PLAIN + LONG][3], positions[PLAIN + LONG][3] = {{0}};
+            memcpy(normals, plain_normals, sizeof plain_normals);
+            memcpy(normals + PLAIN, long_normals, sizeof long_normals);
+            gsd_find_batch(&v, PLAIN + LONG, NULL, positions[0], 12, normals[0], 12, NULL, 0, found, NULL);
+            for (unsigned k = 0; k < PLAIN + LONG; ++k) {
+                gsd_handle plain = gsd_find_cell(&v, 0), h = gsd_find(&v, positions[k], normals[k], NULL);
+                assert_true((h.product > 0) == (found[k].product > 0));
+                for (int draw = 0; draw < 40; ++draw) {
+                    float u[2] = {rndf(), rndf()}, d[3], e[3], pdf = gsd_sample(&v, &h, u, d), batch;
+                    assert_true(isfinite(pdf) && pdf > 0 && pdf == gsd_pdf(&v, &h, d));
+                    assert_true(fabsf(d[0] * d[0] + d[1] * d[1] + d[2] * d[2] - 1) < 1e-6f);
+                    gsd_sample_batch(&v, 1, NULL, &found[k], u, 8, e, 12, &batch);
+                    assert_true(fabsf(batch - pdf) <= 2e-6f * pdf);
+                    assert_true(k >= PLAIN || (pdf == gsd_sample(&v, &plain, u, e) && !memcmp(d, e, sizeof d)));
+                }
+            }
+            gsd_destroy(f);
+        }
+}
+
+/* ---- the normal in a sample */
+
+/* A packed normal in double precision: 8 + 8 bits of an octahedral map. False: none. */
+static bool naive_normal(const uint32_t packed[2], double n[3])
+{
+    double a = ((double)(packed[0] >> 24) - 128) / 127, b = ((double)(packed[1] >> 24) - 128) / 127;
+    double c = 1 - fabs(a) - fabs(b), x = a, y = b;
+    if (packed[0] >> 24 == 0)
+        return false;
+    if (c < 0) { /* the lower half, folded outwards */
+        x = copysign(1 - fabs(b), a);
+        y = copysign(1 - fabs(a), b);
+    }
+    double l = sqrt(x * x + y * y + c * c);
+    n[0] = x / l;
+    n[1] = y / l;
+    n[2] = c / l;
+    return true;
+}
+
+static void test_normals_survive_packing(void **state)
+{
+    (void)state;
+    seed(31);
+    double worst = 0;
+    for (unsigned i = 0; i < 200000; ++i) {
+        float n[3], d[3], back[3];
+        double wide[3];
+        uint32_t packed[2], plain[2];
+        random_direction(d);
+        some_normal(i, n);
+        if (i % 4 == 3) { /* on the folds of the map, and its corners */
+            n[i / 4 % 3] = 0;
+            float l = sqrtf(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]);
+            for (int k = 0; k < 3; ++k)
+                n[k] /= l;
+        }
+        assert_true(gsd_pack_direction(d, n, packed));
+        assert_true(gsd_pack_direction(d, NULL, plain));
+        assert_true(plain[0] >> 24 == 0 && plain[1] >> 24 == 0);
+        assert_true((packed[0] & 0xffffff) == plain[0] && (packed[1] & 0xffffff) == plain[1]);
+        gsd_unpack_normal(packed, back);
+        assert_true(naive_normal(packed, wide));
+        double x = 0, cross;
+        for (int k = 0; k < 3; ++k) {
+            assert_true(fabs((double)back[k] - wide[k]) < 1e-6);
+            x += (double)(n[k] - back[k]) * (double)(n[k] - back[k]);
+        }
+        cross = 2 * asin(sqrt(x) / 2);
+        worst = cross > worst ? cross : worst;
+    }
+    assert_true(worst < PI / 180);
+    assert_true(worst > 0.2 * PI / 180); /* 16 bits cannot do better: the test looks at all of them */
+    /* no normal, or none that can be: zero comes back, and the direction is not harmed */
+    const float none[][3] = {{0, 0, 0}, {NAN, 0, 0}, {0, 1, NAN}, {INFINITY, 0, 0}, {0, -INFINITY, 1}, {1e30f, 0, 0}};
+    for (unsigned i = 0; i < sizeof none / sizeof *none; ++i) {
+        const float d[3] = {0.6f, 0, -0.8f};
+        float back[3] = {1, 1, 1};
+        uint32_t packed[2], plain[2];
+        assert_true(gsd_pack_direction(d, none[i], packed) && gsd_pack_direction(d, NULL, plain));
+        assert_memory_equal(packed, plain, sizeof plain);
+        gsd_unpack_normal(packed, back);
+        assert_true(back[0] == 0 && back[1] == 0 && back[2] == 0);
+    }
+}
+
 /* ---- batches */
 
 static void test_batches_equal_single_queries_at_every_level(void **state)
@@ -638,6 +1117,67 @@ static void test_batches_equal_single_queries_at_every_level(void **state)
             for (uint32_t i = 0; i < N; ++i)
                 apart += fabsf(gsd_pdf(&v, &handles[i], in[i]) - pdf[i]) > 2e-6f * pdf[i];
             assert_true(apart <= 1);
+            gsd_destroy(f);
+        }
+}
+
+/* Oriented handles, such without a normal, with alias tables, of large leaves and of no cell, all in one batch. */
+static void test_batches_of_oriented_handles_equal_single_queries(void **state)
+{
+    (void)state;
+    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_AVX512; ++level)
+        for (int alias = 0; have_level(level) && alias < 2; ++alias) {
+            enum { N = 5003, CELLS = 40 };
+            gsd_tree trees[CELLS];
+            seed((uint64_t)level + 60);
+            for (uint32_t c = 0; c < CELLS; ++c)
+                trees[c] = random_tree(c, 1 + 3 * c, c % 4 ? 16 : 2);
+            gsd_field *f = forest_of_trees(trees, CELLS, (gsd_desc){.alias = alias, .simd = (gsd_simd)level});
+            gsd_view v = gsd_get_view(f);
+            assert_int_equal(v.simd, level);
+            static gsd_handle handles[N];
+            static float u[N][2], dir[N][4], pdf[N], in[N][3];
+            static uint32_t index[N];
+            uint32_t n = 0, oriented = 0;
+            long apart = 0, rounded = 0;
+            for (uint32_t i = 0; i < N; ++i) {
+                float normal[3];
+                handles[i] = gsd_find_cell(&v, i % (CELLS + 3));
+                some_normal((unsigned)(rng_next() % 30), normal);
+                if (rng_next() % 8 < (i / 500 % 2 ? 7 : 3)) /* now most are oriented, now few */
+                    gsd_orient(&v, &handles[i], normal);
+                else if (i % 2)
+                    gsd_orient(&v, &handles[i], (const float[3]){0, 0, 0});
+                oriented += handles[i].product > 0;
+                u[i][0] = i == 5 ? 0 : i == 6 ? 0x1.fffffep-1f : rndf();
+                u[i][1] = i == 7 ? 0 : i == 6 ? 0x1.fffffep-1f : rndf();
+                random_direction(in[i]);
+                pdf[i] = -1;
+                if (i % 3)
+                    index[n++] = N - 1 - i;
+            }
+            assert_true(oriented > N / 3 && oriented < 2 * N / 3);
+            gsd_sample_batch(&v, n, index, handles, u[0], sizeof u[0], dir[0], sizeof dir[0], pdf);
+            for (uint32_t k = 0; k < n; ++k) {
+                uint32_t i = index[k];
+                float d[3], p = gsd_sample(&v, &handles[i], u[i], d);
+                double away = fabs((double)(d[0] - dir[i][0])) + fabs((double)(d[1] - dir[i][1])) +
+                              fabs((double)(d[2] - dir[i][2]));
+                apart += fabsf(p - pdf[i]) > 2e-6f * p || away > 2e-6;
+                rounded += pdf[i] != gsd_pdf(&v, &handles[i], dir[i]);
+            }
+            assert_true(apart <= 1 && rounded <= 1);
+            for (uint32_t i = 0; i < N; i += 3) /* not in the list: untouched */
+                assert_true(pdf[N - 1 - i] == -1);
+            gsd_pdf_batch(&v, n, index, handles, in[0], sizeof in[0], pdf);
+            for (uint32_t i = 0; i < N; ++i)
+                if (i % 3)
+                    assert_true(pdf[N - 1 - i] == gsd_pdf(&v, &handles[N - 1 - i], in[N - 1 - i]));
+                else
+                    assert_true(pdf[N - 1 - i] == -1);
+            gsd_pdf_batch(&v, N, NULL, handles, in[0], sizeof in[0], pdf);
+            for (uint32_t i = 0; i < N; ++i)
+                assert_true(pdf[i] == gsd_pdf(&v, &handles[i], in[i]));
             gsd_destroy(f);
         }
 }
@@ -829,7 +1369,10 @@ static void test_targets_match_a_naive_reference(void **state)
                 y = ((s[i].direction[1] & 0xffffff) + 0.5) / 16777216;
                 naive_leaf(&now, x, y, &p, &area, &id);
                 double naive = (1 - e) * p / area + e / (4 * PI);
-                far += fabs((double)gsd_pdf(&v, &h, (const float[]){direction_of(&s[i], 0), direction_of(&s[i], 1), direction_of(&s[i], 2)}) - naive) > 2e-5 * naive;
+                far += fabs((double)gsd_pdf(&v, &h,
+                                            (const float[]){direction_of(&s[i], 0), direction_of(&s[i], 1),
+                                                            direction_of(&s[i], 2)}) -
+                            naive) > 2e-5 * naive;
                 /* p itself, from the naive sums in the structure of the building tree */
                 double q;
                 naive_leaf(&t, x, y, &q, &area, &id);
@@ -841,6 +1384,197 @@ static void test_targets_match_a_naive_reference(void **state)
         }
         gsd_destroy(f);
     }
+}
+
+/* The same with normals: the value is divided by the cosine of its bin, which queries multiply in again, where the
+   target is a second moment; what the field evaluates of its own density has the normal in it, too. */
+static void test_targets_with_normals_match_a_naive_reference(void **state)
+{
+    (void)state;
+    enum { N = 20000 };
+    for (int target = GSD_TARGET_RADIANCE; target <= GSD_TARGET_VARIANCE; ++target) {
+        seed((uint64_t)target + 40);
+        gsd_desc d = unit_cube((gsd_target)target);
+        gsd_field *f;
+        static gsd_training_sample s[N];
+        static double sum[2048];
+        d.directional_filter = GSD_DIRECTIONAL_NEAREST;
+        d.split_samples = 1e9f;
+        d.smoothing = 0.001f;
+        d.no_history = true;
+        d.alpha_mode = GSD_ALPHA_FIXED;
+        d.alpha = 0.3f;
+        d.no_gate = true;
+        OK(gsd_create(&d, &f));
+        for (int pass = 0; pass < 4; ++pass) {
+            gsd_view v = gsd_get_view(f);
+            gsd_tree t = export(f, GSD_PART_BUILDING, 0), now;
+            reference before = reference_of(f, 0);
+            uint32_t depth[512] = {0}, id;
+            double total = 0, area, p, x, y;
+            long far = 0;
+            assert_true(t.count <= 512);
+            memset(sum, 0, sizeof sum);
+            make_samples(&v, s, N);
+            for (int i = 0; i < N; ++i) {
+                float n[3], u[2] = {rndf(), rndf()}, dir[3];
+                some_normal((unsigned)i % 50, n);
+                gsd_handle h = gsd_find(&v, s[i].position, i % 5 ? n : NULL, NULL);
+                float pb = (float)(0.25 / PI), pg = gsd_sample(&v, &h, u, dir);
+                if (i % 2) {
+                    random_direction(dir);
+                    pg = gsd_pdf(&v, &h, dir);
+                }
+                /* every third: the renderer did not ask for the guide's density */
+                s[i] = gsd_make_scalar_sample(s[i].position, dir, i % 5 ? n : NULL, s[i].radiance, s[i].contribution,
+                                              s[i].pixel_contribution, 0.5f * (pb + pg), pb, i % 3 ? pg : 0);
+                double wide[3], alpha = pass ? (double)d.alpha : 0.5; /* pass 0 did not guide */
+                bool has = naive_normal(s[i].direction, wide);
+                assert_true(has == (i % 5 != 0));
+                x = ((s[i].direction[0] & 0xffffff) + 0.5) / 16777216;
+                y = ((s[i].direction[1] & 0xffffff) + 0.5) / 16777216;
+                double value = (double)(target == GSD_TARGET_VARIANCE ? s[i].pixel_contribution : s[i].contribution);
+                double guide = (double)s[i].pdf_guide;
+                naive_leaf(&before.tree, x, y, &p, &area, &id);
+                if (i % 3 == 0)
+                    guide = pass && has ? reference_pdf(&before, wide, x, y) : 0.99 * p / area + 0.01 / (4 * PI);
+                value *= (1 - alpha) * guide / (alpha * (double)pb + (1 - alpha) * guide);
+                value /= has ? naive_cosine(wide, (uint32_t)(y * 8) * 8 + (uint32_t)(x * 8)) : 1;
+                value = target == GSD_TARGET_RADIANCE ? (double)s[i].radiance : value * value;
+                naive_leaf(&t, x, y, &p, &area, &id);
+                sum[id] += value / (double)s[i].pdf_mix;
+            }
+            learn(f, s, N);
+            OK(gsd_refine(f, NULL, NULL, NULL));
+            now = export(f, GSD_PART_SAMPLING, 0);
+            assert_int_equal(now.count, t.count);
+            for (uint32_t i = 0; i < t.count; ++i)
+                for (uint32_t k = 0; k < 4; ++k) {
+                    uint32_t c = t.child[i * 4 + k];
+                    if (c)
+                        depth[c] = depth[i] + 1;
+                    else if (target != GSD_TARGET_RADIANCE)
+                        sum[i * 4 + k] = sqrt(sum[i * 4 + k] * pow(0.25, depth[i] + 1));
+                    total += c ? 0 : sum[i * 4 + k];
+                }
+            for (int i = 0; i < 2000; ++i) {
+                double q;
+                x = ((s[i].direction[0] & 0xffffff) + 0.5) / 16777216;
+                y = ((s[i].direction[1] & 0xffffff) + 0.5) / 16777216;
+                naive_leaf(&now, x, y, &p, &area, &id);
+                naive_leaf(&t, x, y, &q, &area, &id);
+                far += fabs(p - sum[id] / total) > 3e-5 * p + 1e-7;
+            }
+            assert_int_equal(far, 0);
+            free_tree(&t);
+            free_tree(&now);
+            free_tree(&before.tree);
+        }
+        gsd_destroy(f);
+    }
+}
+
+/* Share of a node's children are pulled towards evenness, as if `smoothing` more samples had been spread over it. The
+   sums and their samples live on through passes of equal size, see test_history_keeps_half_of_all_samples. */
+static void smooth_naively(const gsd_tree *t, const double *mass, uint32_t node, double probability, double lit,
+                           double smoothing, double *out)
+{
+    double children[4], all = 0;
+    for (uint32_t k = 0; k < 4; ++k) {
+        /* mass of the subtree: of all leaves whose path goes through this child */
+        uint32_t stack[64], top = 0;
+        children[k] = 0;
+        stack[top++] = node * 4 + k;
+        while (top) {
+            uint32_t at = stack[--top], c = t->child[at];
+            for (uint32_t j = 0; c && j < 4; ++j)
+                stack[top++] = c * 4 + j;
+            children[k] += c ? 0 : mass[at];
+        }
+        all += children[k];
+    }
+    for (uint32_t k = 0; k < 4; ++k) {
+        double n = lit * all, share = all > 0 ? children[k] / all : 0.25;
+        double pulled = (n * share + smoothing / 4) / (n + smoothing);
+        uint32_t c = t->child[node * 4 + k];
+        if (c)
+            smooth_naively(t, mass, c, probability * pulled, lit, smoothing, out);
+        else
+            out[node * 4 + k] = probability * pulled;
+    }
+}
+
+static void test_smoothing_matches_a_naive_reference(void **state)
+{
+    (void)state;
+    enum { N = 150, PASSES = 4, LEAVES = 4096 };
+    const double kept[PASSES] = {0, 0, 0.5, 2.0 / 3}; /* of the passes before, in passes of equal size */
+    for (int target = GSD_TARGET_RADIANCE; target <= GSD_TARGET_SIMPLE; ++target)
+        for (int strength = 0; strength < 4; ++strength) {
+            const float smoothing[] = {0.001f, 0, 40, 1000};
+            gsd_desc d = unit_cube((gsd_target)target);
+            gsd_field *f;
+            static double sum[LEAVES], mass[LEAVES], expected[LEAVES];
+            double lit = 0;
+            d.directional_filter = GSD_DIRECTIONAL_NEAREST;
+            d.split_samples = 1e9f;
+            d.smoothing = smoothing[strength];
+            d.max_depth = 2;
+            d.rho = 1e-5f; /* every node that has something is divided: the tree keeps its shape */
+            d.alpha_mode = GSD_ALPHA_FIXED;
+            d.no_gate = true;
+            d.no_guide_weight = true;
+            OK(gsd_create(&d, &f));
+            double pull = smoothing[strength] > 0 ? (double)smoothing[strength] : (double)gsd_get_desc(f)->smoothing;
+            memset(sum, 0, sizeof sum);
+            seed((uint64_t)target * 10 + (uint64_t)strength);
+            for (int pass = 0; pass < PASSES; ++pass) {
+                gsd_training_sample s[N];
+                gsd_tree t = export(f, GSD_PART_BUILDING, 0), now;
+                double p, area, total = 0;
+                uint32_t id;
+                assert_int_equal(t.count, 5);
+                for (int i = 0; i < LEAVES; ++i)
+                    sum[i] *= kept[pass];
+                lit *= kept[pass];
+                for (int i = 0; i < N; ++i) {
+                    float at[3] = {0.5f, 0.5f, 0.5f}, dir[3], L = (float)exp(2 * rnd());
+                    random_direction(dir);
+                    L *= dir[2] > 0.3f ? 5 : 1;
+                    L = i % 3 == 0 ? 0 : i % 31 == 1 ? GSD_REJECTED : L; /* zeros are no evidence for a shape */
+                    s[i] = gsd_make_scalar_sample(at, dir, NULL, L, L, L, 0.1f, 0.1f, 0.1f);
+                    naive_leaf(&t, ((s[i].direction[0] & 0xffffff) + 0.5) / 16777216,
+                               ((s[i].direction[1] & 0xffffff) + 0.5) / 16777216, &p, &area, &id);
+                    sum[id] += (double)L * (target == GSD_TARGET_RADIANCE ? 1 : (double)L) / (double)0.1f;
+                    lit += L > 0;
+                }
+                learn(f, s, N);
+                OK(gsd_refine(f, NULL, NULL, NULL));
+                for (uint32_t i = 0; i < t.count * 4; ++i) {
+                    mass[i] = target == GSD_TARGET_RADIANCE ? sum[i] : sqrt(sum[i]);
+                    total += mass[i];
+                }
+                for (uint32_t i = 0; i < t.count * 4; ++i)
+                    mass[i] /= total;
+                smooth_naively(&t, mass, 0, 1, lit, pull, expected);
+                now = export(f, GSD_PART_SAMPLING, 0);
+                double apart = 0;
+                for (int i = 0; i < 200; ++i) { /* the two may number their nodes differently */
+                    double x = rnd(), y = rnd();
+                    naive_leaf(&t, x, y, &p, &area, &id);
+                    double want = expected[id], raw = mass[id];
+                    naive_leaf(&now, x, y, &p, &area, &id);
+                    if (fabs(p - want) > 1e-5 * want)
+                        fail_msg("share %g, expected %g, raw %g: target %d smoothing %g pass %d", p, want, raw, target,
+                                 pull, pass);
+                    apart = fmax(apart, fabs(want - raw));
+                }
+                assert_true(strength == 0 ? apart < 1e-4 : apart > 2e-4); /* and it matters */
+                free_tree(&t);
+                free_tree(&now);
+            }
+            gsd_destroy(f);
+        }
 }
 
 /* The box filter against a brute-force one: overlap of a box of the leaf's size, unfolded over seam and poles. */
@@ -992,6 +1726,66 @@ static void test_cells_split_where_samples_are(void **state)
     gsd_destroy(f);
 }
 
+/* find orients what it finds, alone and in batches: what gsd_find_cell and gsd_orient give. */
+static void test_find_with_normals_equals_its_batch(void **state)
+{
+    (void)state;
+    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_AVX512; ++level) {
+        enum { N = 2003 };
+        if (!have_level(level))
+            continue;
+        gsd_desc d = unit_cube(GSD_TARGET_SIMPLE);
+        d.split_samples = 300;
+        d.simd = (gsd_simd)level;
+        seed(17);
+        gsd_field *f = train(&d, 4, 3000);
+        gsd_view v = gsd_get_view(f);
+        static float position[N][3], normal[N][5], u[N][4], alpha[N];
+        static gsd_handle handles[N];
+        static uint32_t index[N];
+        uint32_t n = 0, oriented = 0, moved = 0;
+        for (uint32_t i = 0; i < N; ++i) {
+            for (int k = 0; k < 3; ++k) {
+                position[i][k] = rndf();
+                u[i][k] = rndf();
+            }
+            some_normal(i % 9, normal[i]);
+            if (i % 7 == 0)
+                memset(normal[i], 0, sizeof normal[i]);
+            if (i % 4)
+                index[n++] = N - 1 - i;
+        }
+        for (int jitter = 0; jitter < 2; ++jitter) {
+            memset(handles, 0x55, sizeof handles);
+            memset(alpha, 0, sizeof alpha);
+            gsd_find_batch(&v, n, index, position[0], sizeof position[0], normal[0], sizeof normal[0],
+                           jitter ? u[0] : NULL, sizeof u[0], handles, alpha);
+            for (uint32_t k = 0; k < n; ++k) {
+                uint32_t i = index[k];
+                gsd_handle h = gsd_find(&v, position[i], normal[i], jitter ? u[i] : NULL);
+                gsd_handle plain = gsd_find(&v, position[i], NULL, jitter ? u[i] : NULL), by_hand;
+                by_hand = gsd_find_cell(&v, plain.cell);
+                assert_memory_equal(&by_hand, &plain, sizeof plain);
+                gsd_orient(&v, &by_hand, normal[i]);
+                assert_memory_equal(&by_hand, &h, sizeof h);
+                assert_true(fabsf(handles[i].product - h.product) <= 2e-6f * h.product);
+                h.product = handles[i].product;
+                assert_memory_equal(&handles[i], &h, sizeof h);
+                assert_true(alpha[i] == h.alpha);
+                assert_true((h.product > 0) == (h.alpha < 1 && h.jump && i % 7 != 0));
+                oriented += h.product > 0;
+                moved += jitter && h.cell != gsd_find(&v, position[i], normal[i], NULL).cell;
+            }
+            gsd_handle untouched;
+            memset(&untouched, 0x55, sizeof untouched);
+            for (uint32_t i = 0; i < N; i += 4)
+                assert_memory_equal(&handles[N - 1 - i], &untouched, sizeof untouched);
+        }
+        assert_true(oriented > N / 2 && moved > N / 4);
+        gsd_destroy(f);
+    }
+}
+
 /* A wall of no thickness, lit from one side: directions towards the lamp are preferred, those through it are not lost.
  */
 static void test_thin_wall_lit_from_one_side(void **state)
@@ -1024,6 +1818,56 @@ static void test_thin_wall_lit_from_one_side(void **state)
     assert_true(up > 0.9f && up < 0.996f);
     assert_true(gsd_pdf(&v, &h, down) > 0 && gsd_pdf(&v, &h, down) < 0.02f);
     gsd_destroy(f);
+}
+
+/* Both sides of such a wall in one cell, a bright lamp above, a dim one below: with normals each side samples its own.
+ */
+static void test_two_sided_cell_samples_the_side_that_is_asked_for(void **state)
+{
+    (void)state;
+    enum { N = 20000 };
+    for (int target = GSD_TARGET_RADIANCE; target <= GSD_TARGET_VARIANCE; ++target)
+        for (int with = 0; with < 2; ++with) {
+            gsd_desc d = unit_cube((gsd_target)target);
+            gsd_field *f;
+            static gsd_training_sample s[N];
+            double above[2] = {0, 0};
+            d.split_samples = 1e9f;
+            d.no_gate = true;
+            OK(gsd_create(&d, &f));
+            seed((uint64_t)target);
+            for (int pass = 0; pass < 4; ++pass) {
+                gsd_view v = gsd_get_view(f);
+                for (int i = 0; i < N; ++i) {
+                    float side = i & 1 ? -1.0f : 1.0f, p[3] = {rndf(), rndf(), 0.5f}, n[3] = {0, 0, side};
+                    float u[2] = {rndf(), rndf()}, dir[3], pb = (float)(0.25 / PI);
+                    gsd_handle h = gsd_find(&v, p, with ? n : NULL, NULL);
+                    float pg = gsd_sample(&v, &h, u, dir);
+                    if (rnd() < (double)h.alpha) {
+                        random_direction(dir);
+                        pg = gsd_pdf(&v, &h, dir);
+                    }
+                    float cosine = dir[2] * side, mix = h.alpha * pb + (1 - h.alpha) * pg;
+                    float L = cosine > 0.7f ? (side > 0 ? 10 : 4) : 0.05f, g = cosine > 0 ? L * cosine : 0;
+                    s[i] = gsd_make_scalar_sample(p, dir, with ? n : NULL, cosine > 0 ? L : GSD_REJECTED, g, g, mix, pb,
+                                                  pg);
+                }
+                learn(f, s, N);
+                OK(gsd_refine(f, NULL, NULL, NULL));
+            }
+            assert_int_equal(gsd_cell_count(f), 1);
+            gsd_view v = gsd_get_view(f);
+            for (int i = 0; i < 20000; ++i) {
+                float side = i & 1 ? -1.0f : 1.0f, p[3] = {0.4f, 0.6f, 0.5f}, n[3] = {0, 0, side}, dir[3];
+                float u[2] = {rndf(), rndf()};
+                gsd_handle h = gsd_find(&v, p, with ? n : NULL, NULL);
+                gsd_sample(&v, &h, u, dir);
+                above[i & 1] += dir[2] * side > 0 ? 1 / 10000.0 : 0;
+            }
+            if (with ? above[0] < 0.9 || above[1] < 0.9 : above[0] < 0.6 || above[1] > 0.4)
+                fail_msg("above the horizon: %g and %g, target %d, normals %d", above[0], above[1], target, with);
+            gsd_destroy(f);
+        }
 }
 
 /* ---- bad input */
@@ -1108,6 +1952,39 @@ static void test_bad_samples_are_refused_and_leave_no_trace(void **state)
         assert_true(same_fields(a, b));
         gsd_destroy(a);
         gsd_destroy(b);
+    }
+}
+
+static void test_samples_without_direction_are_refused_with_a_normal_too(void **state)
+{
+    (void)state;
+    const float bad[][3] = {{0, 0, 0},        {NAN, 0, 1},       {0, NAN, 0},         {1, 0, NAN},
+                            {INFINITY, 0, 0}, {0, 0, -INFINITY}, {-INFINITY, NAN, 1}, {1e-9f, 0, 0}};
+    const float p[3] = {0.5f, 0.5f, 0.5f}, n[3] = {0, 1, 0}, one[3] = {1, 1, 1}, good[3] = {3, 0, 4};
+    enum { BAD = sizeof bad / sizeof *bad };
+    gsd_training_sample s[2 * BAD + 1];
+    for (unsigned i = 0; i < BAD; ++i) {
+        s[2 * i] = gsd_make_scalar_sample(p, bad[i], i % 2 ? n : NULL, 1, 1, 1, 1, 1, 0);
+        s[2 * i + 1] = gsd_make_sample(p, bad[i], n, one, one, 1, NULL, 1, 1, 0);
+    }
+    s[2 * BAD] = gsd_make_sample(p, good, n, one, one, 1, NULL, 1, 1, 0); /* any length will do */
+    float x[3] = {0.6f, 0, 0.8f};
+    uint32_t packed[2];
+    assert_true(gsd_pack_direction(x, n, packed));
+    assert_true(abs((int)(packed[0] - s[2 * BAD].direction[0])) <= 1);
+    assert_true(abs((int)(packed[1] - s[2 * BAD].direction[1])) <= 1);
+    for (int target = GSD_TARGET_RADIANCE; target <= GSD_TARGET_SIMPLE; ++target) {
+        gsd_desc d = unit_cube((gsd_target)target);
+        gsd_field *f;
+        gsd_stats stats;
+        OK(gsd_create(&d, &f));
+        learn(f, s, 2 * BAD + 1);
+        gsd_get_stats(f, &stats);
+        assert_int_equal(stats.refused, 2 * BAD);
+        assert_int_equal(stats.samples, 1);
+        OK(gsd_refine(f, NULL, NULL, NULL));
+        OK(gsd_validate(f));
+        gsd_destroy(f);
     }
 }
 
@@ -1500,6 +2377,152 @@ static void test_alpha_is_learned(void **state)
         }
 }
 
+/* ---- history */
+
+/* Passes of these many samples, each worth 1 in the building tree's sums; expected: what the sums hold after refine. */
+static void check_history(const gsd_desc *d, const uint32_t *sizes, int passes, const double *expected)
+{
+    gsd_field *f;
+    OK(gsd_create(d, &f));
+    seed(1);
+    for (int pass = 0; pass < passes; ++pass) {
+        gsd_training_sample *s = malloc(sizes[pass] * sizeof *s);
+        double held = 0, sum = 0;
+        for (uint32_t i = 0; i < sizes[pass]; ++i) {
+            float p[3] = {rndf(), rndf(), rndf()}, dir[3];
+            random_direction(dir);
+            s[i] = gsd_make_scalar_sample(p, dir, NULL, 1, 1, 1, 1, 1, 1);
+        }
+        learn(f, s, sizes[pass]);
+        OK(gsd_refine(f, NULL, NULL, NULL));
+        OK(gsd_validate(f));
+        gsd_stats stats;
+        gsd_get_stats(f, &stats);
+        assert_int_equal(stats.waiting_cells, 0);
+        for (uint32_t c = 0; c < gsd_cell_count(f); ++c) {
+            gsd_tree t = export(f, GSD_PART_BUILDING, c);
+            for (uint32_t i = 0; i < 4; ++i)
+                sum += (double)t.value[i];
+            held += f->states[c].held;
+            assert_true(fabs(f->states[c].lit - f->states[c].held) <= 1e-9 * held);
+            free_tree(&t);
+        }
+        if (fabs(held - expected[pass]) > 1e-9 * held)
+            fail_msg("%g samples held after pass %d, expected %g", held, pass, expected[pass]);
+        if (d->target == GSD_TARGET_RADIANCE)
+            assert_true(fabs(sum - held) <= 1e-4 * held);
+        free(s);
+    }
+    gsd_destroy(f);
+}
+
+/* The rule in the words of the comment on no_history, independent of the code. */
+static void expect_history(const uint32_t *sizes, int passes, double *expected)
+{
+    double all = 0, held = 0;
+    for (int pass = 0; pass < passes; ++pass) {
+        double n = sizes[pass], next = n;
+        if (pass > 0)
+            next = n * fmin(2, fmax(1, n / sizes[pass - 1])); /* the next pass will be as large */
+        all += n;
+        held += n;
+        held = fmin(held, fmax(0, (all + next) / 2 - next)); /* with it, half of all shall count */
+        expected[pass] = held;
+    }
+}
+
+static void test_history_keeps_half_of_all_samples(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    d.split_samples = 1e9f;
+    d.no_gate = true;
+    d.alpha_mode = GSD_ALPHA_FIXED;
+    d.min_samples = 1;
+    double expected[8];
+    const uint32_t equal[] = {600, 600, 600, 600, 600, 600}, doubling[] = {200, 400, 800, 1600, 3200};
+    const uint32_t growing[] = {500, 700, 1000, 1100, 1500, 2100}, odd[] = {500, 500, 2500, 20, 30, 500, 500, 90};
+    expect_history(equal, 6, expected);
+    for (int pass = 0; pass < 6; ++pass) /* half of pass + 1 passes, when the next has come */
+        assert_true(fabs(expected[pass] - 300 * pass) < 1e-9);
+    check_history(&d, equal, 6, expected);
+    expect_history(doubling, 5, expected);
+    for (int pass = 0; pass < 5; ++pass)
+        assert_true(expected[pass] == 0);
+    check_history(&d, doubling, 5, expected);
+    expect_history(growing, 6, expected);
+    assert_true(expected[5] > 1000);
+    check_history(&d, growing, 6, expected);
+    expect_history(odd, 8, expected);
+    assert_true(expected[3] == 20); /* no more than there is */
+    check_history(&d, odd, 8, expected);
+    /* the cells of a split share what is kept */
+    d.split_samples = 100;
+    expect_history(equal, 6, expected);
+    check_history(&d, equal, 4, expected);
+}
+
+static void test_no_history_keeps_nothing(void **state)
+{
+    (void)state;
+    const uint32_t equal[] = {300, 300, 300, 300}, shrinking[] = {3000, 300, 200, 100};
+    const double nothing[4] = {0, 0, 0, 0};
+    for (int target = GSD_TARGET_RADIANCE; target <= GSD_TARGET_VARIANCE; ++target) {
+        gsd_desc d = unit_cube((gsd_target)target);
+        d.no_history = true;
+        d.min_samples = 1;
+        d.split_samples = 1e9f;
+        check_history(&d, equal, 4, nothing);
+        check_history(&d, shrinking, 4, nothing);
+    }
+}
+
+/* What was learned for one target is of no use for the next; the count of all samples begins anew, too. */
+static void test_switching_the_target_clears_the_history(void **state)
+{
+    (void)state;
+    const uint32_t equal[] = {400, 400, 400, 400, 400, 400}, uneven[] = {400, 900, 100, 100, 100, 100, 100};
+    const double expected[] = {0, 200, 0, 0, 200, 400}, soon[] = {0, 0, 50, 100, 150, 200, 250};
+    gsd_desc d = unit_cube(GSD_TARGET_SWITCHING);
+    d.split_samples = 1e9f;
+    d.no_gate = true;
+    d.min_samples = 1;
+    d.switch_after = 3;
+    check_history(&d, equal, 6, expected);
+    /* 1300 samples are 3.25 first passes' worth */
+    check_history(&d, uneven, 7, (const double[]){0, 0, 0, 50, 100, 150, 200});
+    d.switch_after = 3.2f;
+    check_history(&d, uneven, 7, soon);
+    /* cells that wait for more samples lose them as well */
+    gsd_field *f;
+    static gsd_training_sample s[20000];
+    d.split_samples = 200;
+    d.min_samples = 64;
+    d.switch_after = 3;
+    d.no_history = true;
+    OK(gsd_create(&d, &f));
+    seed(3);
+    for (int pass = 0; pass < 3; ++pass) {
+        gsd_view v = gsd_get_view(f);
+        make_samples(&v, s, 20000);
+        for (int i = 0; pass == 2 && i < 20000; ++i) /* but for a few, all near a corner */
+            for (int k = 0; k < 3; ++k)
+                s[i].position[k] *= i < 300 ? 1 : 0.1f;
+        learn(f, s, 20000);
+        OK(gsd_refine(f, NULL, NULL, NULL));
+        OK(gsd_validate(f));
+        gsd_stats stats;
+        gsd_get_stats(f, &stats);
+        assert_true(pass < 2 || stats.waiting_cells > 10);
+        assert_int_equal(f->target, pass < 2 ? GSD_TARGET_SIMPLE : GSD_TARGET_VARIANCE);
+    }
+    for (uint32_t c = 0; c < gsd_cell_count(f); ++c)
+        assert_true(f->states[c].held == 0 && f->states[c].lit == 0);
+    for (uint32_t i = 0; i < f->building_nodes; ++i)
+        assert_true(f->sum[i] == 0);
+    gsd_destroy(f);
+}
+
 /* ---- structure */
 
 static void test_unread_and_waiting_cells_are_left_alone(void **state)
@@ -1804,14 +2827,28 @@ int main(void)
         cmocka_unit_test(test_sample_and_pdf_agree),
         cmocka_unit_test(test_estimates_with_the_density_are_unbiased),
         cmocka_unit_test(test_seam_poles_and_odd_directions),
+        cmocka_unit_test(test_oriented_density_integrates_to_one),
+        cmocka_unit_test(test_oriented_density_matches_a_naive_reference),
+        cmocka_unit_test(test_oriented_samples_follow_the_density),
+        cmocka_unit_test(test_oriented_batches_follow_the_density),
+        cmocka_unit_test(test_oriented_sample_and_pdf_agree),
+        cmocka_unit_test(test_cells_of_a_forest_are_oriented),
+        cmocka_unit_test(test_odd_normals_do_no_harm),
+        cmocka_unit_test(test_normals_survive_packing),
         cmocka_unit_test(test_batches_equal_single_queries_at_every_level),
+        cmocka_unit_test(test_batches_of_oriented_handles_equal_single_queries),
         cmocka_unit_test(test_results_do_not_depend_on_threads_or_cuts),
         cmocka_unit_test(test_targets_match_a_naive_reference),
+        cmocka_unit_test(test_targets_with_normals_match_a_naive_reference),
+        cmocka_unit_test(test_smoothing_matches_a_naive_reference),
         cmocka_unit_test(test_box_filter_matches_brute_force),
         cmocka_unit_test(test_trees_refine_where_the_mass_is),
         cmocka_unit_test(test_cells_split_where_samples_are),
+        cmocka_unit_test(test_find_with_normals_equals_its_batch),
         cmocka_unit_test(test_thin_wall_lit_from_one_side),
+        cmocka_unit_test(test_two_sided_cell_samples_the_side_that_is_asked_for),
         cmocka_unit_test(test_bad_samples_are_refused_and_leave_no_trace),
+        cmocka_unit_test(test_samples_without_direction_are_refused_with_a_normal_too),
         cmocka_unit_test(test_positions_outside_are_clamped_and_counted),
         cmocka_unit_test(test_rejected_and_zero_samples_count),
         cmocka_unit_test(test_every_failed_allocation_is_survived),
@@ -1826,6 +2863,9 @@ int main(void)
         cmocka_unit_test(test_gate_weighs_by_pixels),
         cmocka_unit_test(test_closed_cells_are_tried_again),
         cmocka_unit_test(test_alpha_is_learned),
+        cmocka_unit_test(test_history_keeps_half_of_all_samples),
+        cmocka_unit_test(test_no_history_keeps_nothing),
+        cmocka_unit_test(test_switching_the_target_clears_the_history),
         cmocka_unit_test(test_unread_and_waiting_cells_are_left_alone),
         cmocka_unit_test(test_forest_split_export_and_import),
         cmocka_unit_test(test_save_and_load_give_the_same_field),

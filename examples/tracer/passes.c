@@ -13,10 +13,7 @@
 #include <string.h>
 
 #define MAX_GROUPS 32
-#ifndef GROWTH
-#define GROWTH 4 
-#endif
-/* a learning pass is 1 / GROWTH of all before it */
+#define GROWTH 4 /* a learning pass is 1 / GROWTH of all before it */
 #define ROUND_PATHS (1 << 17) /* paths between two flushes: bounds the memory of records */
 
 /* Passes that were sampled in the same way, or nearly so: plain sums are the best way to join them. */
@@ -399,7 +396,7 @@ static bool learn(render_state *r, const tr_pass *pass)
 
 /* Samples of a learning pass: a quarter of all before it. Guiding learns in generations, each from paths that the one
    before has guided; sums live on from pass to pass, so passes need not double. */
-static int pass_spp(int done_spp) { return done_spp < 4 ? 1 : done_spp / GROWTH; }
+static int pass_spp(int done_spp) { return done_spp < GROWTH ? 1 : done_spp / GROWTH; }
 
 /* Samples for pass k. A pass that would leave too little for a full next one takes the rest instead; `last` tells. */
 static int plan_pass(const render_state *r, int pass, int done_spp, double cost_per_sample, bool *last)
