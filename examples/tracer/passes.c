@@ -39,6 +39,7 @@ typedef struct render_state {
     tr_result *result;
     double start_cpu, update_cpu;
     uint64_t round_tile; /* first tile of the round */
+    bool guided;         /* the last pass met cells that guide */
 } render_state;
 
 static size_t pixel_count(const render_state *r) { return (size_t)r->frame.width * (size_t)r->frame.height; }
@@ -394,15 +395,19 @@ static bool learn(render_state *r, const tr_pass *pass)
     return ok;
 }
 
-/* Samples of a learning pass: a quarter of all before it. Guiding learns in generations, each from paths that the one
-   before has guided; sums live on from pass to pass, so passes need not double. */
-static int pass_spp(int done_spp) { return done_spp < GROWTH ? 1 : done_spp / GROWTH; }
+/* Samples of a pass. Guiding learns in generations, each from paths that the one before has guided; sums live on from
+   pass to pass, so passes need not double: a quarter of all before. Where nothing is guided they do. */
+static int pass_spp(int done_spp, bool guided)
+{
+    int spp = guided ? done_spp / GROWTH : done_spp;
+    return spp < 1 ? 1 : spp < 1 << 24 ? spp : 1 << 24;
+}
 
 /* Samples for pass k. A pass that would leave too little for a full next one takes the rest instead; `last` tells. */
 static int plan_pass(const render_state *r, int pass, int done_spp, double cost_per_sample, bool *last)
 {
     const tr_settings *s = r->settings;
-    int spp = r->settings->method->learns ? pass_spp(done_spp) : 1 << (pass < 24 ? pass : 24);
+    int spp = pass_spp(done_spp, r->guided);
     *last = false;
     if (s->spp > 0) {
         int left = s->spp - done_spp;
@@ -433,7 +438,8 @@ static bool run_passes(render_state *r)
         done += taken;
         info.spp = taken;
         cost = (cpu_used(r) - cpu) / taken;
-        ok = close_pass(r, done - taken, taken, total_guided(r) > guided_before);
+        r->guided = total_guided(r) > guided_before;
+        ok = close_pass(r, done - taken, taken, r->guided);
         if (ok && !info.last && !out_of_time)
             ok = learn(r, &info);
         res->pass[pass].spp = taken;
