@@ -42,20 +42,35 @@
      >>files  >>check  >>plain  >>licence
 
    HOW IT WORKS
-     Space is a binary tree over a cube: axes in turn, cut in the middle, a leaf (*cell*) splits when it saw more than
-     c sqrt(2^k) samples. Every cell has a quadtree over directions (z, phi), equal-area, that refines where a node
-     holds more than rho of the mass [Mueller 2017]. A field has a *sampling part*, one flat relocatable block that
+     Space is a binary tree over a cube: axes in turn, cut in the middle. A leaf (*cell*) splits when it holds more than
+     max(32, 2 sqrt(N)) samples, N = those that the whole field holds (or c sqrt(N / N of the first pass) with
+     desc.split_samples = c [Mueller 2017]), unless fewer than a 24th of that are non-zero. Every cell has a quadtree over directions (z, phi), equal-area,
+     that refines where a node holds more than rho of the mass. A field has a *sampling part*, one flat relocatable block that
      queries read and only refine (and import, load, gsd_forest_split) replaces, and a *building part* that accumulate
      writes. Density of a direction: (1 - e) learned + e/(4 pi), e = 0.01 (desc.uniform); it integrates to 1.
      Directions are unit, world space, away from the surface towards the light. phi = atan2(y, x) in [0, 2 pi).
+
+     Product: with the surface's normal n given to gsd_find, the learned density is multiplied by a softened cosine
+     c_k(n) (gsd_bin_cosine), constant in each of 8 x 8 bins k of (phi, z), and divided by its mean: exact, since pdf and
+     sample speak of the same c_k. One cell can then serve both sides of a thin wall, and nothing is spent below the
+     horizon. Quadtrees learn incident light without the cosine: give the same normal to gsd_make_sample.
 
      What is learned (desc.target); p = pdf_mix, the density the direction was drawn with:
        radiance        mass of a leaf = sum of L / p                                              [Mueller 2017]
        simple          sqrt(solid angle * sum of (contribution * w)^2 / p)                        [Rath 2020]
        variance-aware  the same with pixel_contribution                                           [Rath 2020]
-       switching       simple in passes 0..3, variance-aware from pass 4 (desc.switch_pass); sums cleared between
+       switching       simple, then variance-aware after desc.switch_after first passes' worth of samples; sums
+                       cleared between
+     For the second moments the contribution is divided by c_k(n) first, where the sample has a normal.
      w = (1 - a) pdf_guide / (a pdf_bsdf + (1 - a) pdf_guide), a = the cell's alpha, but 0.5 where the cell did not
      guide; desc.no_guide_weight sets w = 1.
+
+     History: refine keeps as much of the sums that half of all samples recorded so far count in the next pass. Passes
+     can so be short: what a pass learns from are paths that the pass before has guided, so many short passes learn more
+     from the same samples than few long ones [unlike Mueller 2017, who clears the sums and doubles]. Recommended: a
+     pass of a quarter of all samples before it.
+     Smoothing: what few samples say is uncertain. The shares of a node's children in the sampling tree are
+     (n share + K / 4) / (n + K), n = the node's non-zero samples (mass share times the cell's), K = desc.smoothing.
 
      Selection probability: handle.alpha is the probability to sample the BSDF; 1 means: do not guide here. The caller
      draws from the BSDF with alpha, else from gsd_sample, and divides by alpha pdf_bsdf + (1 - alpha) gsd_pdf.
@@ -73,7 +88,8 @@
    THE SAMPLE
      One per non-delta path vertex whose direction was traced. radiance L: from that direction, no cosine, no BSDF, not
      divided by a pdf; light that next-event estimation can sample weighted by its MIS weight; connections of this
-     vertex not included. Zeros count: record them. gsd_make_sample fills one from RGB arrays. A direction rejected
+     vertex not included. Zeros count: record them. gsd_make_sample fills one from RGB arrays; the normal is the one that
+     gsd_find got. A direction rejected
      before tracing (f = 0) has radiance GSD_REJECTED (-0.0f): it counts as a visit and as a zero for the second-moment
      targets and the gate. pdf_guide = 0 means "not evaluated"; the field evaluates it where it needs it.
      A vertex that was recorded counts as a read of its cell; cells without new samples are left alone by refine.
@@ -85,9 +101,9 @@
      directions: skip three levels, carry the cosine), 12 per leaf with desc.alias, 4 per spatial node, and 16 KB.
      Building part: 12 bytes per quadtree node, sizeof(gsd_cell_state) (below 600) per cell.
      max_bytes bounds the peak of both parts while refine runs, old and new together: trees coarsen and cells stop
-     splitting; it never fails. Streams (44 bytes per sample) and the scratch of accumulate (at most 12 MB and 8 bytes
+     splitting; it never fails. Streams (44 bytes per sample) and the scratch of accumulate (at most 13 MB and 8 bytes
      per cell, kept for the next call) come on top. Allocation happens in create, stream_create, record, accumulate,
-   refine, import, load, gsd_forest_split; never in a query. Stack: below 16 KB per call.
+     refine, import, load, gsd_forest_split; never in a query. Stack: below 16 KB per call.
 
    THREADS: each function has a tag.
      [any thread]   pure function on constant data
@@ -215,7 +231,7 @@ typedef struct gsd_desc {
     bool no_gate;  /* guide in every cell */
     bool no_guide_weight;  /* second-moment targets: w = 1 */
     bool no_history;       /* clear the sums in every refine; see HOW IT WORKS */
-    float smoothing;       /* samples' worth of evenness in each node's shares, 0.001 .. 1000; default 3; see below */
+    float smoothing;       /* K, samples' worth of evenness, see HOW IT WORKS, 0.001 .. 1000; default 3 */
     bool alias;            /* build alias tables: sampling in constant time, but not monotone in u; + 12 bytes a leaf */
     float gate_margin;     /* V(1) / V(a) - 1 below which guiding does not pay, 0.001 .. 10; default 0.05 */
     float gate_gain;       /* V(1) - V(a) below which guiding does not pay, 0.0001 .. 1000; default 0.25 */
@@ -905,6 +921,8 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_MIN_REBUILDS 3       /* before that verdict: the first trees are noise */
 #define GSDI_SPLIT 2.0            /* a cell splits above that times sqrt(samples held): tuned on SF1 (1 .. 2), ajar */
 #define GSDI_MIN_SPLIT 32.0       /* at least */
+#define GSDI_LIT 24.0             /* ... times its share of non-zero samples: parts of a dark cell would know too little;
+                                     tuned on lamps, ajar (8 .. 32) */
 #define GSDI_MAX_CELLS (1u << 26)
 
 /* ---- >>memory ----------------------------------------------------------------------------------------------- */
@@ -2265,6 +2283,7 @@ static void gsdi_split_cell(gsdi_refinement *r, uint32_t cell, uint32_t node)
         gsdi_place *a = &r->places[p.place], *b;
         uint32_t axis = a->level % 3, k;
         if (!r->jobs[cell].rebuild || s->gate == GSD_GATE_CLOSED || p.levels == 6 || (double)a->samples <= r->split ||
+            (double)a->samples * s->lit * GSDI_LIT < r->split * s->held ||
             a->level >= r->desc->max_levels || r->cells >= r->cell_limit || r->cells >= r->place_capacity)
             continue;
         r->stats.split_cells++;

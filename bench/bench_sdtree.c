@@ -500,6 +500,20 @@ static double lap(double *since)
     return passed;
 }
 
+/* What a renderer knows about its samples: the guide's density, where it guides. */
+static void fill_pdf_guide(const gsd_field *field, gsd_training_sample *samples, uint32_t count)
+{
+    gsd_view view = gsd_get_view(field);
+    for (uint32_t i = 0; i < count; ++i) {
+        gsd_training_sample *s = &samples[i];
+        float n[3], d[3];
+        gsd_unpack_normal(s->direction, n);
+        gsd_direction((s->direction[0] & 0xffffff) + 0.5, (s->direction[1] & 0xffffff) + 0.5, d);
+        gsd_handle h = gsd_find(&view, s->position, n, NULL);
+        s->pdf_guide = h.alpha < 1 ? gsd_pdf(&view, &h, d) : 0;
+    }
+}
+
 /* Learn SF1 from about 2^log2n samples in SF1_UPDATES equal updates. naive may be NULL: it gets the same samples. */
 static gsd_field *learn(const gsd_desc *desc, int log2n, uint64_t seed, int exact, learning *t, naive_learner *naive,
                         double *naive_seconds)
@@ -514,6 +528,7 @@ static gsd_field *learn(const gsd_desc *desc, int log2n, uint64_t seed, int exac
     check(gsd_stream_create(field, &stream), "stream");
     for (int update = 0; update < SF1_UPDATES; ++update) {
         uint32_t count = draw_samples(&rng, n, update, exact, samples), i;
+        fill_pdf_guide(field, samples, count);
         double time = bench_seconds();
         for (i = 0; i < count; i += 64)
             check(gsd_record(stream, samples + i, count - i < 64 ? count - i : 64), "record");

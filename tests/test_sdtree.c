@@ -1641,6 +1641,7 @@ static void test_trees_refine_where_the_mass_is(void **state)
 {
     (void)state;
     gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    d.split_samples = 1000;
     seed(3);
     gsd_field *f = train(&d, 5, 4000);
     gsd_tree t = export(f, GSD_PART_SAMPLING, 0);
@@ -1724,6 +1725,45 @@ static void test_cells_split_where_samples_are(void **state)
         assert_true(alpha[i] == h.alpha);
     }
     gsd_destroy(f);
+}
+
+/* By default a cell splits when it holds more than max(32, 2 sqrt(all samples held)): no cell is left with more, and no
+   two halves were split that have no more together. */
+static void test_split_threshold_follows_the_samples(void **state)
+{
+    (void)state;
+    enum { N = 12000, CELLS = 4096 };
+    static gsd_training_sample s[N];
+    static uint32_t counts[CELLS];
+    for (uint32_t n = 100; n <= N; n = n < 1000 ? n * 4 : n * 3) { /* 100, 400, 1600, 4800 */
+        gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+        gsd_field *f;
+        double limit = fmax(32, 2 * sqrt(n));
+        long split = 0;
+        OK(gsd_create(&d, &f));
+        gsd_view v = gsd_get_view(f);
+        seed(n);
+        make_samples(&v, s, n);
+        learn(f, s, n);
+        OK(gsd_refine(f, NULL, NULL, NULL));
+        v = gsd_get_view(f);
+        assert_true(v.cell_count < CELLS);
+        memset(counts, 0, sizeof counts);
+        for (uint32_t i = 0; i < n; ++i)
+            counts[gsd_find(&v, s[i].position, NULL, NULL).cell]++;
+        for (uint32_t c = 0; c < v.cell_count; ++c)
+            assert_true(counts[c] <= limit);
+        for (uint32_t i = 0; i < f->block->spatial; ++i) {
+            uint32_t first = v.spatial[i];
+            if (first & GSD_CELL_BIT || !(v.spatial[first] & v.spatial[first + 1] & GSD_CELL_BIT))
+                continue;
+            assert_true(counts[v.spatial[first] & ~GSD_CELL_BIT] + counts[v.spatial[first + 1] & ~GSD_CELL_BIT] >
+                        limit);
+            split++;
+        }
+        assert_true(split > 0);
+        gsd_destroy(f);
+    }
 }
 
 /* find orients what it finds, alone and in batches: what gsd_find_cell and gsd_orient give. */
@@ -2416,7 +2456,7 @@ static void check_history(const gsd_desc *d, const uint32_t *sizes, int passes, 
     gsd_destroy(f);
 }
 
-/* The rule in the words of the comment on no_history, independent of the code. */
+/* The rule in the words of its comment, step by step. */
 static void expect_history(const uint32_t *sizes, int passes, double *expected)
 {
     double all = 0, held = 0;
@@ -2482,17 +2522,17 @@ static void test_switching_the_target_clears_the_history(void **state)
 {
     (void)state;
     const uint32_t equal[] = {400, 400, 400, 400, 400, 400}, uneven[] = {400, 900, 100, 100, 100, 100, 100};
-    const double expected[] = {0, 200, 0, 0, 200, 400}, soon[] = {0, 0, 50, 100, 150, 200, 250};
+    const double expected[] = {0, 200, 0, 0, 200, 400}, early[] = {0, 0, 0, 50, 100, 150, 200};
+    const double late[] = {0, 0, 100, 0, 0, 50, 100};
     gsd_desc d = unit_cube(GSD_TARGET_SWITCHING);
     d.split_samples = 1e9f;
     d.no_gate = true;
     d.min_samples = 1;
     d.switch_after = 3;
     check_history(&d, equal, 6, expected);
-    /* 1300 samples are 3.25 first passes' worth */
-    check_history(&d, uneven, 7, (const double[]){0, 0, 0, 50, 100, 150, 200});
-    d.switch_after = 3.2f;
-    check_history(&d, uneven, 7, soon);
+    check_history(&d, uneven, 7, early); /* after 1300 samples: 3.25 first passes' worth */
+    d.switch_after = 3.6f;
+    check_history(&d, uneven, 7, late); /* after 1500 */
     /* cells that wait for more samples lose them as well */
     gsd_field *f;
     static gsd_training_sample s[20000];
@@ -2844,6 +2884,7 @@ int main(void)
         cmocka_unit_test(test_box_filter_matches_brute_force),
         cmocka_unit_test(test_trees_refine_where_the_mass_is),
         cmocka_unit_test(test_cells_split_where_samples_are),
+        cmocka_unit_test(test_split_threshold_follows_the_samples),
         cmocka_unit_test(test_find_with_normals_equals_its_batch),
         cmocka_unit_test(test_thin_wall_lit_from_one_side),
         cmocka_unit_test(test_two_sided_cell_samples_the_side_that_is_asked_for),
