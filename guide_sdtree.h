@@ -44,15 +44,16 @@
    HOW IT WORKS
      Space is a binary tree over a cube: axes in turn, cut in the middle. A leaf (*cell*) splits when it holds more than
      max(32, 2 sqrt(N)) samples, N = those that the whole field holds (or c sqrt(N / N of the first pass) with
-     desc.split_samples = c [Mueller 2017]), unless fewer than a 24th of that are non-zero. Every cell has a quadtree over directions (z, phi), equal-area,
-     that refines where a node holds more than rho of the mass. A field has a *sampling part*, one flat relocatable block that
-     queries read and only refine (and import, load, gsd_forest_split) replaces, and a *building part* that accumulate
-     writes. Density of a direction: (1 - e) learned + e/(4 pi), e = 0.01 (desc.uniform); it integrates to 1.
-     Directions are unit, world space, away from the surface towards the light. phi = atan2(y, x) in [0, 2 pi).
+     desc.split_samples = c [Mueller 2017]), unless fewer than a 24th of that are non-zero. Every cell has a quadtree
+   over directions (z, phi), equal-area, that refines where a node holds more than rho of the mass. A field has a
+   *sampling part*, one flat relocatable block that queries read and only refine (and import, load, gsd_forest_split)
+   replaces, and a *building part* that accumulate writes. Density of a direction: (1 - e) learned + e/(4 pi), e = 0.01
+   (desc.uniform); it integrates to 1. Directions are unit, world space, away from the surface towards the light. phi =
+   atan2(y, x) in [0, 2 pi).
 
      Product: with the surface's normal n given to gsd_find, the learned density is multiplied by a softened cosine
-     c_k(n) (gsd_bin_cosine), constant in each of 8 x 8 bins k of (phi, z), and divided by its mean: exact, since pdf and
-     sample speak of the same c_k. One cell can then serve both sides of a thin wall, and nothing is spent below the
+     c_k(n) (gsd_bin_cosine), constant in each of 8 x 8 bins k of (phi, z), and divided by its mean: exact, since pdf
+   and sample speak of the same c_k. One cell can then serve both sides of a thin wall, and nothing is spent below the
      horizon. Quadtrees learn incident light without the cosine: give the same normal to gsd_make_sample.
 
      What is learned (desc.target); p = pdf_mix, the density the direction was drawn with:
@@ -88,11 +89,11 @@
    THE SAMPLE
      One per non-delta path vertex whose direction was traced. radiance L: from that direction, no cosine, no BSDF, not
      divided by a pdf; light that next-event estimation can sample weighted by its MIS weight; connections of this
-     vertex not included. Zeros count: record them. gsd_make_sample fills one from RGB arrays; the normal is the one that
-     gsd_find got. A direction rejected
-     before tracing (f = 0) has radiance GSD_REJECTED (-0.0f): it counts as a visit and as a zero for the second-moment
-     targets and the gate. pdf_guide = 0 means "not evaluated"; the field evaluates it where it needs it.
-     A vertex that was recorded counts as a read of its cell; cells without new samples are left alone by refine.
+     vertex not included. Zeros count: record them. gsd_make_sample fills one from RGB arrays; the normal is the one
+   that gsd_find got. A direction rejected before tracing (f = 0) has radiance GSD_REJECTED (-0.0f): it counts as a
+   visit and as a zero for the second-moment targets and the gate. pdf_guide = 0 means "not evaluated"; the field
+   evaluates it where it needs it. A vertex that was recorded counts as a read of its cell; cells without new samples
+   are left alone by refine.
 
    OPTIONS: see gsd_desc. gsd_resolve fills in defaults, gsd_get_desc returns what a field uses.
 
@@ -605,7 +606,8 @@ GSD_QUERY void gsd_orient(const gsd_view *view, gsd_handle *handle, const float 
     const float *mass = view->masses + handle->jump;
     float z[8] = {0, 0, 0, 0, 0, 0, 0, 0};
     uint32_t k, i;
-    if (handle->jump == 0 || handle->alpha >= 1 || !(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2] > 0.5f))
+    if (handle->jump == 0 || handle->alpha >= 1 ||
+        !(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2] > 0.5f))
         return;
     for (k = 0; k < 64; k += 8)
         for (i = 0; i < 8; ++i)
@@ -921,8 +923,9 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_MIN_REBUILDS 3       /* before that verdict: the first trees are noise */
 #define GSDI_SPLIT 2.0            /* a cell splits above that times sqrt(samples held): tuned on SF1 (1 .. 2), ajar */
 #define GSDI_MIN_SPLIT 32.0       /* at least */
-#define GSDI_LIT 24.0             /* ... times its share of non-zero samples: parts of a dark cell would know too little;
-                                     tuned on lamps, ajar (8 .. 32) */
+#define GSDI_LIT                                                                                                       \
+    24.0 /* ... times its share of non-zero samples: parts of a dark cell would know too little;                       \
+            tuned on lamps, ajar (8 .. 32) */
 #define GSDI_MAX_CELLS (1u << 26)
 
 /* ---- >>memory ----------------------------------------------------------------------------------------------- */
@@ -1394,8 +1397,8 @@ typedef struct gsdi_accumulation {
 /* False where a sample is bad: not finite, negative, out of range, no density. */
 static bool gsdi_sample_valid(const gsd_training_sample *s)
 {
-    return s->radiance >= 0 && (double)s->radiance < GSDI_MAX_VALUE &&
-           s->contribution >= 0 && (double)s->contribution < GSDI_MAX_VALUE && s->pixel_contribution >= 0 &&
+    return s->radiance >= 0 && (double)s->radiance < GSDI_MAX_VALUE && s->contribution >= 0 &&
+           (double)s->contribution < GSDI_MAX_VALUE && s->pixel_contribution >= 0 &&
            (double)s->pixel_contribution < GSDI_MAX_VALUE && s->pdf_mix > 0 && gsdi_finite(s->pdf_mix) &&
            s->pdf_bsdf >= 0 && gsdi_finite(s->pdf_bsdf) && s->pdf_guide >= 0 && gsdi_finite(s->pdf_guide) &&
            (double)s->radiance < GSDI_MAX_VALUE * (double)s->pdf_mix &&
@@ -1985,7 +1988,8 @@ static void gsdi_block_bins(gsdi_block *b)
     float *bins = gsdi_floats(b, b->bins_at);
     uint32_t i;
     for (i = 0; i < GSDI_BINS; ++i) {
-        double z0 = (i >> 3) * 0.25 - 1, z1 = z0 + 0.25, width = 0.78539816339744831, p = (i & 7u) * width, q = p + width;
+        double z0 = (i >> 3) * 0.25 - 1, z1 = z0 + 0.25, width = 0.78539816339744831, p = (i & 7u) * width,
+               q = p + width;
         double r = 2 * (z1 * sqrt(1 - z1 * z1) + asin(z1) - z0 * sqrt(1 - z0 * z0) - asin(z0));
         bins[i] = (float)(r * (sin(q) - sin(p)) / width);
         bins[i + GSDI_BINS] = (float)(r * (cos(p) - cos(q)) / width);
@@ -2181,7 +2185,7 @@ typedef struct gsdi_refinement {
     gsd_target target; /* of the next pass */
     double all_samples, held_samples;
     double rho, keep, split;
-    double fade; /* of the gate's sums */
+    double fade;          /* of the gate's sums */
     gsdi_job *jobs;       /* [old cells] */
     double *mass;         /* [building nodes] */
     unsigned char *depth; /* [building nodes] */
@@ -2283,8 +2287,8 @@ static void gsdi_split_cell(gsdi_refinement *r, uint32_t cell, uint32_t node)
         gsdi_place *a = &r->places[p.place], *b;
         uint32_t axis = a->level % 3, k;
         if (!r->jobs[cell].rebuild || s->gate == GSD_GATE_CLOSED || p.levels == 6 || (double)a->samples <= r->split ||
-            (double)a->samples * s->lit * GSDI_LIT < r->split * s->held ||
-            a->level >= r->desc->max_levels || r->cells >= r->cell_limit || r->cells >= r->place_capacity)
+            (double)a->samples * s->lit * GSDI_LIT < r->split * s->held || a->level >= r->desc->max_levels ||
+            r->cells >= r->cell_limit || r->cells >= r->place_capacity)
             continue;
         r->stats.split_cells++;
         b = &r->places[r->cells];
@@ -2353,8 +2357,8 @@ static bool gsdi_split_cells(gsdi_refinement *r)
 /* Nodes and cells that fit under max_bytes, when the old and the new part, and scratch, exist together. */
 static uint64_t gsdi_node_limit(const gsdi_refinement *r, uint32_t cells)
 {
-    uint64_t per_cell = 2 * (sizeof(gsdi_state) + sizeof(gsd_cell) + sizeof(gsdi_tree) + 8 * GSDI_BINS) + sizeof(gsdi_job) +
-                        sizeof(gsdi_place) + sizeof(gsdi_tree) + 6 * sizeof(uint32_t) + 64;
+    uint64_t per_cell = 2 * (sizeof(gsdi_state) + sizeof(gsd_cell) + sizeof(gsdi_tree) + 8 * GSDI_BINS) +
+                        sizeof(gsdi_job) + sizeof(gsdi_place) + sizeof(gsdi_tree) + 6 * sizeof(uint32_t) + 64;
     uint64_t per_node = 2 * (16 + (r->desc->alias ? 9 : 0)) + 2 * 12 + 9;
     uint64_t fixed = 2 * (GSDI_GRID * 4 + 2048) + sizeof(gsd_field) + cells * per_cell;
     return fixed < r->desc->max_bytes ? (r->desc->max_bytes - fixed) / per_node : 0;
@@ -2836,7 +2840,7 @@ GSD_API gsd_result gsd_create(const gsd_desc *desc, gsd_field **out)
     if (!field)
         return GSD_OUT_OF_MEMORY;
     field->desc = d;
-    field->target = d.target == GSD_TARGET_SWITCHING ? GSD_TARGET_SIMPLE : (uint32_t)d.target;
+    field->target = (uint32_t)(d.target == GSD_TARGET_SWITCHING ? GSD_TARGET_SIMPLE : d.target);
     cells = d.forest_cells ? d.forest_cells : 1;
     depth = gsdi_start_depth(&d);
     nodes = gsdi_start_nodes(depth);
@@ -3132,7 +3136,8 @@ GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t
         for (i = 0; i < n; ++i) {
             if (u) {
                 uint32_t at = gsdi_at(index, start + i);
-                cell[i] = gsd_find(view, gsdi_row(positions, position_stride, at), NULL, gsdi_row(u, u_stride, at)).cell;
+                cell[i] =
+                    gsd_find(view, gsdi_row(positions, position_stride, at), NULL, gsdi_row(u, u_stride, at)).cell;
             } else {
                 cell[i] = gsd_cell_at(view, g[i]);
             }
@@ -3978,9 +3983,9 @@ static bool gsdi_state_ok(const gsd_field *field, const gsdi_state *s, const gsd
     uint32_t k;
     if (c->tree >= field->block->trees || s->gate > GSD_GATE_CLOSED || !(s->alpha >= 0.049f && s->alpha <= 1) ||
         !(s->theta > -10 && s->theta < 10) || !gsdi_finite(s->moment1) || !gsdi_finite(s->moment2) ||
-        !(s->held >= 0 && s->held < 1e18) || !(s->lit >= 0 && s->lit < 1e18) || !(s->fresh >= 0 && s->fresh < 1e18) || !(s->flow >= 0 && s->flow < 1e50) ||
-        !(s->gate_count >= 0) || !(s->weight >= 0 && s->weight < 1e300) || !(s->pixel >= 0 && s->pixel < 1e300) ||
-        !(s->pixel_v >= 0 && s->pixel_v < 1e300) || s->level > 60)
+        !(s->held >= 0 && s->held < 1e18) || !(s->lit >= 0 && s->lit < 1e18) || !(s->fresh >= 0 && s->fresh < 1e18) ||
+        !(s->flow >= 0 && s->flow < 1e50) || !(s->gate_count >= 0) || !(s->weight >= 0 && s->weight < 1e300) ||
+        !(s->pixel >= 0 && s->pixel < 1e300) || !(s->pixel_v >= 0 && s->pixel_v < 1e300) || s->level > 60)
         return false;
     for (k = 0; k <= GSDI_GATE_LOW; ++k)
         if (!(s->v[k] >= 0 && s->v[k] < 1e300) || !(s->vv[k] >= 0 && s->vv[k] < 1e300))

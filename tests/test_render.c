@@ -54,12 +54,13 @@ static tr_result render(const tr_scene *scene, const tr_settings *settings)
     return r;
 }
 
-/* Largest |z| over 16x16 tiles and channels of the difference of two renders, and the z of the whole image. A tile's
-   variance gets a floor: 0.1 % of its value, so that float rounding is no difference. */
+/* Largest |z| over 16x16 tiles and channels of the difference of two renders, and over channels of the whole image (the
+   channels of a path are correlated: their sum would look three times as certain as it is). A tile's variance gets a
+   floor: 0.1 % of its value, so that float rounding is no difference. */
 static double worst_z(const tr_result *a, const tr_result *b, double *whole)
 {
     int w = a->color.width, h = a->color.height;
-    double worst = 0, all_difference = 0, all_variance = 0;
+    double worst = 0, all_difference[3] = {0, 0, 0}, all_variance[3] = {0, 0, 0};
     for (int y0 = 0; y0 < h; y0 += 16)
         for (int x0 = 0; x0 < w; x0 += 16)
             for (int c = 0; c < 3; ++c) {
@@ -71,12 +72,14 @@ static double worst_z(const tr_result *a, const tr_result *b, double *whole)
                         variance += (double)a->variance.data[i] + b->variance.data[i];
                         value += a->color.data[i];
                     }
-                all_difference += difference;
-                all_variance += variance;
+                all_difference[c] += difference;
+                all_variance[c] += variance;
                 double z = fabs(difference) / sqrt(variance + 1e-6 * value * value + 1e-20);
                 worst = z > worst ? z : worst;
             }
-    *whole = fabs(all_difference) / sqrt(all_variance + 1e-20);
+    *whole = 0;
+    for (int c = 0; c < 3; ++c)
+        *whole = fmax(*whole, fabs(all_difference[c]) / sqrt(all_variance[c] + 1e-20));
     return worst;
 }
 

@@ -969,6 +969,53 @@ static bool have_level(int level)
     return gsd_resolve(&probe, &resolved) == GSD_OK;
 }
 
+/* Draws that end within rounding of a bin's edge in a leaf of many bins: still the density of the rounded direction. */
+static void test_oriented_samples_at_edges_of_bins(void **state)
+{
+    (void)state;
+    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_AVX512; ++level) {
+        if (!have_level(level))
+            continue;
+        gsd_field *f = oriented_forest(0, 4, (gsd_desc){.simd = (gsd_simd)level});
+        gsd_view v = gsd_get_view(f);
+        long crossed = 0;
+        for (int round = 0; round < 6000; ++round) {
+            gsd_handle h = gsd_find_cell(&v, 0), handles[5];
+            float n[3], u[5][2], d[5][3], pdf[5];
+            uint32_t low = 1 << 20, high = (1 << 24) - 1, axis = (uint32_t)round % 2, x[2];
+            float other = 0.1f + 0.9f * rndf();
+            random_direction(n);
+            gsd_orient(&v, &h, n);
+            uint32_t wanted = 1 + (uint32_t)(rng_next() % 7);
+            while (high - low > 1) { /* the first number that leads beyond the edge */
+                uint32_t middle = (low + high) / 2;
+                u[0][axis] = (float)middle * 0x1p-24f;
+                u[0][1 - axis] = other;
+                gsd_sample(&v, &h, u[0], d[0]);
+                gsd_coordinates(d[0], &x[0], &x[1]);
+                if (x[axis] >> 21 < wanted)
+                    low = middle;
+                else
+                    high = middle;
+            }
+            for (uint32_t i = 0; i < 5; ++i) {
+                u[i][axis] = (float)(low - 2 + i) * 0x1p-24f;
+                u[i][1 - axis] = other;
+                handles[i] = h;
+                pdf[i] = gsd_sample(&v, &h, u[i], d[i]);
+                assert_true(pdf[i] == gsd_pdf(&v, &h, d[i]));
+                gsd_coordinates(d[i], &x[0], &x[1]);
+                crossed += x[axis] + 1 - wanted * 2097152 < 2; /* the cell of numbers on either side */
+            }
+            gsd_sample_batch(&v, 5, NULL, handles, u[0], sizeof u[0], d[0], sizeof d[0], pdf);
+            for (uint32_t i = 0; i < 5; ++i)
+                assert_true(pdf[i] == gsd_pdf(&v, &h, d[i]));
+        }
+        assert_true(crossed > 3000); /* the edges were met */
+        gsd_destroy(f);
+    }
+}
+
 /* Normals that are none leave the density as it is; those far from unit length spoil nothing. */
 static void test_odd_normals_do_no_harm(void **state)
 {
@@ -2496,10 +2543,19 @@ static void test_history_keeps_half_of_all_samples(void **state)
     expect_history(odd, 8, expected);
     assert_true(expected[3] == 20); /* no more than there is */
     check_history(&d, odd, 8, expected);
+    const uint32_t jump[] = {600, 600, 600, 600, 600, 2100, 600}, fall[] = {600, 600, 600, 600, 600, 500, 400};
+    expect_history(jump, 7, expected); /* 3.5 times as many now are no reason to expect more than twice as many next */
+    assert_true(expected[5] == 450);
+    check_history(&d, jump, 7, expected);
+    expect_history(fall, 7, expected); /* nor fewer than now */
+    assert_true(expected[5] == 1500);
+    check_history(&d, fall, 7, expected);
     /* the cells of a split share what is kept */
+    const uint32_t split[] = {600, 600, 600, 600, 1100};
     d.split_samples = 100;
-    expect_history(equal, 6, expected);
-    check_history(&d, equal, 4, expected);
+    expect_history(split, 5, expected);
+    assert_true(expected[4] > 700);
+    check_history(&d, split, 5, expected);
 }
 
 static void test_no_history_keeps_nothing(void **state)
@@ -2872,6 +2928,7 @@ int main(void)
         cmocka_unit_test(test_oriented_samples_follow_the_density),
         cmocka_unit_test(test_oriented_batches_follow_the_density),
         cmocka_unit_test(test_oriented_sample_and_pdf_agree),
+        cmocka_unit_test(test_oriented_samples_at_edges_of_bins),
         cmocka_unit_test(test_cells_of_a_forest_are_oriented),
         cmocka_unit_test(test_odd_normals_do_no_harm),
         cmocka_unit_test(test_normals_survive_packing),

@@ -4,8 +4,8 @@
    (samples of a cell before it splits), rho, smoothing, max_depth, max_levels, min_samples, max_memory_mb,
    spatial_filter=nearest|stochastic, directional_filter=nearest|box, learn_alpha=grid|adam|off (on = grid), alpha,
    gate=on|off, gate_margin, gate_gain, gate_probe, guide_weight=on|off, history=on|off, uniform, alias=on|off,
-   simd=scalar|avx2|avx512, product=on|off (with the cosine), jitter=on|off (find looks up a jittered position), sparse=on|off (closed fields record only
-   some tiles). */
+   simd=scalar|avx2|avx512, product=on|off (with the cosine), jitter=on|off (find looks up a jittered position),
+   sparse=on|off (closed fields record only some tiles). */
 #include <stdlib.h>
 #include <string.h>
 
@@ -188,8 +188,8 @@ static gsd_training_sample convert(const sdtree *m, const tr_vertex *v)
     memcpy(L, &v->L, sizeof L);
     memcpy(f, &v->f, sizeof f);
     memcpy(w, &v->pixel_weight, sizeof w);
-    gsd_training_sample s = gsd_make_sample(p, d, m->product && !(v->flags & TR_VERTEX_PASSES) ? n : NULL, L, f, v->cosine, w,
-                                            v->pdf_mix, v->pdf_bsdf, v->pdf_guide);
+    gsd_training_sample s = gsd_make_sample(p, d, m->product && !(v->flags & TR_VERTEX_PASSES) ? n : NULL, L, f,
+                                            v->cosine, w, v->pdf_mix, v->pdf_bsdf, v->pdf_guide);
     if (v->flags & TR_VERTEX_REJECTED) {
         s.radiance = GSD_REJECTED;
         s.contribution = s.pixel_contribution = 0;
@@ -249,8 +249,8 @@ static void sdtree_find(void *method, const tr_lookup *lookup, void *handles, fl
         return;
     }
     gsd_find_batch(&m->view, (uint32_t)lookup->n, NULL, &lookup->p->x, sizeof(vec3),
-                   m->product ? &lookup->side->x : NULL, sizeof(vec3),
-                   m->jitter && lookup->u ? lookup->u[0] : NULL, sizeof lookup->u[0], handles, alpha);
+                   m->product ? &lookup->side->x : NULL, sizeof(vec3), m->jitter && lookup->u ? lookup->u[0] : NULL,
+                   sizeof lookup->u[0], handles, alpha);
 }
 
 /* Index lists of ints are lists of uint32_t: the two types may alias, and no index is negative. */

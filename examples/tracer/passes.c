@@ -13,7 +13,7 @@
 #include <string.h>
 
 #define MAX_GROUPS 32
-#define GROWTH 4 /* a learning pass is 1 / GROWTH of all before it */
+#define GROWTH 4              /* a learning pass is 1 / GROWTH of all before it */
 #define ROUND_PATHS (1 << 17) /* paths between two flushes: bounds the memory of records */
 
 /* Passes that were sampled in the same way, or nearly so: plain sums are the best way to join them. */
