@@ -345,7 +345,7 @@ static void deposit_layers(tr_worker *w, const tr_frame *frame)
 
 static void find_handles(tr_worker *w, const tr_frame *frame)
 {
-    bool guiding = frame->method->find != NULL;
+    bool guiding = frame->guiding;
     w->smooth_count = 0;
     for (int i = 0; i < w->active_count; ++i) {
         int id = w->active[i], k = w->smooth_count;
@@ -381,7 +381,7 @@ static void find_handles(tr_worker *w, const tr_frame *frame)
 static void describe_vertices(tr_worker *w, const tr_frame *frame)
 {
     float cell[TR_BATCH], depth[TR_BATCH];
-    bool describe = frame->describe && frame->method->describe && w->smooth_count > 0;
+    bool describe = frame->describe && frame->guiding && frame->method->describe && w->smooth_count > 0;
     if (describe)
         frame->method->describe(frame->method_data, w->smooth_count, w->handles, cell, depth);
     for (int k = 0; k < w->smooth_count; ++k) {
@@ -517,7 +517,8 @@ static void roulette(tr_worker *w, const tr_frame *frame, int depth)
 {
     int kept = 0;
     tr_roulette mode = frame->settings->roulette;
-    bool guided = mode == TR_ROULETTE_GUIDED && frame->estimate && frame->method->reflected && w->smooth_count > 0;
+    bool guided = mode == TR_ROULETTE_GUIDED && frame->guiding && frame->estimate && frame->method->reflected &&
+                  w->smooth_count > 0;
     if (guided)
         frame->method->reflected(frame->method_data, w->smooth_count, w->handles, w->reflected);
     else if (mode != TR_ROULETTE_THROUGHPUT)
@@ -680,7 +681,7 @@ static inline bool follow(tr_worker *w, const tr_frame *frame, int id, const cho
 static void scatter(tr_worker *w, const tr_frame *frame, bool recording)
 {
     choice choices[TR_BATCH];
-    bool guiding = frame->method->find != NULL;
+    bool guiding = frame->guiding;
     if (guiding)
         choose_guided(w, frame, choices);
     int kept = 0;

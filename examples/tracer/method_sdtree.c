@@ -238,16 +238,15 @@ static bool sdtree_end_pass(void *method, const tr_pass *pass)
 
 /* ---- queries */
 
+static bool sdtree_idle(void *method)
+{
+    const sdtree *m = method;
+    return gsd_all_closed(m->field);
+}
+
 static void sdtree_find(void *method, const tr_lookup *lookup, void *handles, float *alpha)
 {
     const sdtree *m = method;
-    if (gsd_all_closed(m->field)) {
-        gsd_handle *h = handles;
-        for (int i = 0; i < lookup->n; ++i)
-            alpha[i] = 1;
-        memset(h, 0, (size_t)lookup->n * sizeof *h);
-        return;
-    }
     gsd_find_batch(&m->view, (uint32_t)lookup->n, NULL, &lookup->p->x, sizeof(vec3),
                    m->product ? &lookup->side->x : NULL, sizeof(vec3), m->jitter && lookup->u ? lookup->u[0] : NULL,
                    sizeof lookup->u[0], handles, alpha);
@@ -268,14 +267,12 @@ static void sdtree_pdf(void *method, int n, const int *index, const void *handle
     gsd_pdf_batch(&m->view, (uint32_t)n, (const uint32_t *)index, handles, &wi->x, sizeof *wi, pdf);
 }
 
-/* Not told where nothing guides: such a field must not change a bit of the picture. */
 static void sdtree_reflected(void *method, int n, const void *handles, float *radiance)
 {
-    const sdtree *m = method;
     const gsd_handle *h = handles;
-    bool closed = gsd_all_closed(m->field);
+    (void)method;
     for (int i = 0; i < n; ++i)
-        radiance[i] = closed ? 0 : h[i].reflected;
+        radiance[i] = h[i].reflected;
 }
 
 /* ---- reports */
@@ -325,6 +322,7 @@ const tr_method tr_method_sdtree = {.name = "sdtree",
                                     .create = sdtree_create,
                                     .destroy = sdtree_destroy,
                                     .begin_pass = sdtree_begin_pass,
+                                    .idle = sdtree_idle,
                                     .find = sdtree_find,
                                     .sample = sdtree_sample,
                                     .pdf = sdtree_pdf,

@@ -433,6 +433,7 @@ static bool run_passes(render_state *r)
         double cpu = cpu_used(r);
         uint64_t guided_before = total_guided(r);
         r->frame.record = m->begin_pass ? m->begin_pass(r->frame.method_data, &info) : m->record != NULL;
+        r->frame.guiding = m->find && !(m->idle && m->idle(r->frame.method_data));
         r->frame.estimate = m->wants_pixel_estimate && pass > 0 ? &r->estimate : NULL;
         int taken = run_pass(r, pass, info.spp, done, &out_of_time);
         done += taken;

@@ -467,6 +467,7 @@ typedef struct tr_method {
     void (*destroy)(void *method);
     /* false = this pass needs no records (nothing to learn any more). */
     bool (*begin_pass)(void *method, const tr_pass *pass);
+    bool (*idle)(void *method); /* true = nothing would be guided in this pass: do not ask */
     /* Fill handles[i] and alpha[i], the probability of bsdf sampling; 1 = do not guide here. */
     void (*find)(void *method, const tr_lookup *lookup, void *handles, float *alpha);
     /* For the handles listed in index[0..n): direction and its density. pdf 0 = none. */
