@@ -408,7 +408,7 @@ GSD_API gsd_result gsd_accumulate(gsd_field *field, gsd_stream *const *streams, 
 GSD_API gsd_result gsd_refine(gsd_field *field, const gsd_pass *pass, gsd_parallel_fn parallel, void *user);
 
 /* Share of image tiles (or paths) that are worth recording in the next pass: 1 while much of the field guides or has
-   no verdict, down to 1/16 when nearly all of it is closed: enough to notice changes. [any thread] */
+   no verdict, down to 1/64 when nearly all of it is closed: enough to notice changes. [any thread] */
 GSD_API float gsd_record_fraction(const gsd_field *field);
 /* True when no cell guides: a renderer may skip every query until the next refine. [any thread] */
 GSD_API bool gsd_all_closed(const gsd_field *field);
@@ -2900,7 +2900,7 @@ GSD_API bool gsd_all_closed(const gsd_field *field) { return field->guiding == 0
 GSD_API float gsd_record_fraction(const gsd_field *field)
 {
     float open = 1 - field->stats.closed_share;
-    return field->passes == 0 || open > 0.5f ? 1.0f : open + (1 - open) / 16;
+    return field->passes == 0 || open > 0.5f ? 1.0f : open + (1 - open) / 64;
 }
 
 GSD_API void gsd_get_stats(const gsd_field *field, gsd_stats *stats)
