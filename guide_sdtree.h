@@ -222,8 +222,8 @@ typedef struct gsd_desc {
     float rho;            /* share of a quadtree's mass above which a node is divided, 1e-5 .. 1; default 0.01 */
     uint32_t max_depth;   /* of quadtrees, 1 .. 20; default 16 */
     uint32_t max_levels;  /* of the spatial tree (3 levels halve all axes), 1 .. 60; default 48 */
-    uint32_t min_samples; /* a cell with fewer new samples waits for more before its tree is rebuilt; default 16 */
-    uint64_t max_bytes;   /* memory cap, see MEMORY; >= 65536; default 2^30 */
+    uint32_t min_samples; /* a cell that holds fewer samples waits for more before its tree is rebuilt; default 16 */
+    uint64_t max_bytes;   /* memory cap, see MEMORY; >= 2^20; default 2^30 */
     gsd_spatial_filter spatial_filter;
     gsd_directional_filter directional_filter;
     gsd_alpha_mode alpha_mode;
@@ -1683,7 +1683,7 @@ static void gsdi_round(gsdi_accumulation *a, gsd_parallel_fn parallel, void *use
 static bool gsdi_accumulation_start(gsdi_accumulation *a, gsd_field *field, uint64_t samples)
 {
     const gsd_desc *desc = &field->desc;
-    uint64_t n = samples < GSDI_ROUND ? samples : GSDI_ROUND, cells = field->block->cells, size;
+    uint64_t n = ((samples < GSDI_ROUND ? samples : GSDI_ROUND) + 1) & ~(uint64_t)1, cells = field->block->cells, size;
     memset(a, 0, sizeof *a);
     a->field = field;
     a->view = gsd_get_view(field);
@@ -1983,9 +1983,8 @@ static bool gsdi_block_places(gsdi_tree *trees, uint32_t count, gsdi_block *shap
 
 /* Means of the directions in each bin: with r(z) = sqrt(1 - z^2), the mean of r over z by its integral, of cos phi and
    sin phi likewise. */
-static void gsdi_block_bins(gsdi_block *b)
+static void gsdi_bin_means(float *bins)
 {
-    float *bins = gsdi_floats(b, b->bins_at);
     uint32_t i;
     for (i = 0; i < GSDI_BINS; ++i) {
         double z0 = (i >> 3) * 0.25 - 1, z1 = z0 + 0.25, width = 0.78539816339744831, p = (i & 7u) * width,
@@ -2002,7 +2001,7 @@ static void gsdi_block_uniform(gsdi_block *b)
 {
     gsd_node *nodes = gsdi_nodes(b);
     uint32_t i;
-    gsdi_block_bins(b);
+    gsdi_bin_means(gsdi_floats(b, b->bins_at));
     for (i = 0; i < b->roots; ++i) {
         nodes[i].leaf.child = 0;
         nodes[i].leaf.pdf = GSD_INV_4PI;
@@ -4008,10 +4007,15 @@ GSD_API gsd_result gsd_validate(const gsd_field *field)
     const gsdi_block *b = field->block;
     const gsdi_tree *trees = gsdi_trees(b);
     gsd_view view = gsd_get_view(field);
+    float bins[3 * GSDI_BINS];
     uint32_t i;
     for (i = 0; i < b->roots; ++i)
         if (i < 4 && (view.nodes[i].leaf.child || memcmp(&view.nodes[i].leaf.pdf, &view.nodes[0].leaf.pdf, 4) ||
                       !(fabsf(view.nodes[i].leaf.pdf - GSD_INV_4PI) < 1e-7f)))
+            return GSD_CORRUPT;
+    gsdi_bin_means(bins);
+    for (i = 0; i < 3 * GSDI_BINS; ++i) /* libraries may round sines differently */
+        if (!(fabsf(view.bins[i] - bins[i]) < 1e-6f))
             return GSD_CORRUPT;
     if (trees[0].groups)
         return GSD_CORRUPT;
