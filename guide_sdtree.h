@@ -45,16 +45,16 @@
      Space is a binary tree over a cube: axes in turn, cut in the middle. A leaf (*cell*) splits when it holds more than
      max(32, 2 sqrt(N)) samples, N = those that the whole field holds (or c sqrt(N / N of the first pass) with
      desc.split_samples = c [Mueller 2017]), unless fewer than a 24th of that are non-zero. Every cell has a quadtree
-   over directions (z, phi), equal-area, that refines where a node holds more than rho of the mass. A field has a
-   *sampling part*, one flat relocatable block that queries read and only refine (and import, load, gsd_forest_split)
-   replaces, and a *building part* that accumulate writes. Density of a direction: (1 - e) learned + e/(4 pi), e = 0.01
-   (desc.uniform); it integrates to 1. Directions are unit, world space, away from the surface towards the light. phi =
-   atan2(y, x) in [0, 2 pi).
+     over directions (z, phi), equal-area, that refines where a node holds more than rho of the mass. A field has a
+     *sampling part*, one flat relocatable block that queries read and only refine (and import, load,
+     gsd_forest_split) replaces, and a *building part* that accumulate writes. Density of a direction: (1 - e) learned
+     + e/(4 pi), e = 0.01 (desc.uniform); it integrates to 1. Directions are unit, world space, away from the surface
+     towards the light. phi = atan2(y, x) in [0, 2 pi).
 
      Product: with the surface's normal n given to gsd_find, the learned density is multiplied by a softened cosine
      c_k(n) (gsd_bin_cosine), constant in each of 8 x 8 bins k of (phi, z), and divided by its mean: exact, since pdf
-   and sample speak of the same c_k. One cell can then serve both sides of a thin wall, and nothing is spent below the
-     horizon. Quadtrees learn incident light without the cosine: give the same normal to gsd_make_sample.
+     and sample speak of the same c_k. One cell can then serve both sides of a thin wall, and nothing is spent below
+     the horizon. Quadtrees learn incident light without the cosine: give the same normal to gsd_make_sample.
 
      What is learned (desc.target); p = pdf_mix, the density the direction was drawn with:
        radiance        mass of a leaf = sum of L / p                                              [Mueller 2017]
@@ -90,10 +90,10 @@
      One per non-delta path vertex whose direction was traced. radiance L: from that direction, no cosine, no BSDF, not
      divided by a pdf; light that next-event estimation can sample weighted by its MIS weight; connections of this
      vertex not included. Zeros count: record them. gsd_make_sample fills one from RGB arrays; the normal is the one
-   that gsd_find got. A direction rejected before tracing (f = 0) has radiance GSD_REJECTED (-0.0f): it counts as a
-   visit and as a zero for the second-moment targets and the gate. pdf_guide = 0 means "not evaluated"; the field
-   evaluates it where it needs it. A vertex that was recorded counts as a read of its cell; cells without new samples
-   are left alone by refine.
+     that gsd_find got. A direction rejected before tracing (f = 0) has radiance GSD_REJECTED (-0.0f): it counts as a
+     visit and as a zero for the second-moment targets and the gate. pdf_guide = 0 means "not evaluated"; the field
+     evaluates it where it needs it. A vertex that was recorded counts as a read of its cell; cells without new
+     samples are left alone by refine.
 
    OPTIONS: see gsd_desc. gsd_resolve fills in defaults, gsd_get_desc returns what a field uses.
 
@@ -4013,6 +4013,12 @@ GSD_API gsd_result gsd_validate(const gsd_field *field)
         if (i < 4 && (view.nodes[i].leaf.child || memcmp(&view.nodes[i].leaf.pdf, &view.nodes[0].leaf.pdf, 4) ||
                       !(fabsf(view.nodes[i].leaf.pdf - GSD_INV_4PI) < 1e-7f)))
             return GSD_CORRUPT;
+    if (field->target < GSD_TARGET_RADIANCE || field->target > GSD_TARGET_VARIANCE ||
+        !(field->first_pass_samples >= 0 && field->first_pass_samples < 1e18) ||
+        !(field->last_pass_samples >= 0 && field->last_pass_samples < 1e18) ||
+        !(field->all_samples >= 0 && field->all_samples < 1e18) ||
+        !(field->held_samples >= 0 && field->held_samples < 1e18))
+        return GSD_CORRUPT;
     gsdi_bin_means(bins);
     for (i = 0; i < 3 * GSDI_BINS; ++i) /* libraries may round sines differently */
         if (!(fabsf(view.bins[i] - bins[i]) < 1e-6f))
