@@ -409,6 +409,29 @@ static double chi_square_deviate(double chi2, double df)
     return (cbrt(chi2 / df) - (1 - 2 / (9 * df))) / sqrt(2 / (9 * df));
 }
 
+/* Chi-square of counts and its degrees of freedom; slots that expect fewer than 20 are counted as one. What expects
+   nothing must be empty. */
+static double chi_square(const double *expected, const long *seen, uint32_t slots, double *df)
+{
+    double rest = 0, rest_seen = 0, chi2 = 0;
+    *df = -1;
+    for (uint32_t i = 0; i < slots; ++i) {
+        assert_true(expected[i] > 0 || seen[i] == 0);
+        if (expected[i] < 20) {
+            rest += expected[i];
+            rest_seen += (double)seen[i];
+            continue;
+        }
+        chi2 += ((double)seen[i] - expected[i]) * ((double)seen[i] - expected[i]) / expected[i];
+        *df += 1;
+    }
+    if (rest > 5) {
+        chi2 += (rest_seen - rest) * (rest_seen - rest) / rest;
+        *df += 1;
+    }
+    return chi2;
+}
+
 static void chi_square_of(bool alias, uint32_t depth, uint64_t s)
 {
     seed(s);
@@ -416,7 +439,7 @@ static void chi_square_of(bool alias, uint32_t depth, uint64_t s)
     gsd_view v = gsd_get_view(f);
     gsd_handle h = gsd_find_cell(&v, 0);
     gsd_tree t = export(f, GSD_PART_SAMPLING, 0);
-    double *expected = calloc(t.count * 4, sizeof *expected), rest = 0, rest_seen = 0, chi2 = 0, df = -1;
+    double *expected = calloc(t.count * 4, sizeof *expected), chi2, df;
     long *seen = calloc(t.count * 4, sizeof *seen), n = scaled(1000000);
     uint32_t *depths = calloc(t.count, sizeof *depths);
     for (uint32_t i = 0; i < t.count; ++i)
@@ -436,21 +459,7 @@ static void chi_square_of(bool alias, uint32_t depth, uint64_t s)
         naive_leaf(&t, x, y, &p, &area, &id);
         seen[id]++;
     }
-    for (uint32_t i = 0; i < t.count * 4; ++i) {
-        if (expected[i] <= 0)
-            continue;
-        if (expected[i] < 20) {
-            rest += expected[i];
-            rest_seen += (double)seen[i];
-            continue;
-        }
-        chi2 += ((double)seen[i] - expected[i]) * ((double)seen[i] - expected[i]) / expected[i];
-        df += 1;
-    }
-    if (rest > 5) {
-        chi2 += (rest_seen - rest) * (rest_seen - rest) / rest;
-        df += 1;
-    }
+    chi2 = chi_square(expected, seen, t.count * 4, &df);
     if (chi_square_deviate(chi2, df) > 4)
         fail_msg("chi-square %g at %g degrees of freedom (alias %d)", chi2, df, alias);
     free(expected);
@@ -809,7 +818,7 @@ static void oriented_chi_square(unsigned kind, unsigned normal, bool alias, bool
     uint32_t count;
     part *p = parts_of(&r.tree, &count);
     uint32_t slots = r.tree.count * 4 * 64 * 4;
-    double *expected = calloc(slots, sizeof *expected), rest = 0, rest_seen = 0, chi2 = 0, df = -1;
+    double *expected = calloc(slots, sizeof *expected), chi2, df;
     long *seen = calloc(slots, sizeof *seen), n = scaled(200000);
     static float u[BLOCK][2], d[BLOCK][3], pdf[BLOCK], axis[3];
     some_normal(normal, axis);
@@ -841,20 +850,7 @@ static void oriented_chi_square(unsigned kind, unsigned normal, bool alias, bool
             seen[(id * 64 + (uint32_t)(y * 8) * 8 + (uint32_t)(x * 8)) * 4 + quarter]++;
         }
     }
-    for (uint32_t i = 0; i < slots; ++i) {
-        assert_true(expected[i] > 0 || seen[i] == 0);
-        if (expected[i] < 20) {
-            rest += expected[i];
-            rest_seen += (double)seen[i];
-            continue;
-        }
-        chi2 += ((double)seen[i] - expected[i]) * ((double)seen[i] - expected[i]) / expected[i];
-        df += 1;
-    }
-    if (rest > 5) {
-        chi2 += (rest_seen - rest) * (rest_seen - rest) / rest;
-        df += 1;
-    }
+    chi2 = chi_square(expected, seen, slots, &df);
     assert_true(df >= 15);
     if (chi_square_deviate(chi2, df) > 4)
         fail_msg("chi-square %g at %g degrees of freedom (kind %u, normal %u, alias %d, batch %d)", chi2, df, kind,
