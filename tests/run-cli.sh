@@ -188,6 +188,12 @@ report $? 'imgerr: missing file is named'
 "$imgerr" bad.exr one.exr >out 2>log
 [ $? -eq 1 ] && grep -q 'bad\.exr' log
 report $? 'imgerr: unreadable file is named'
+"$imgerr" --regions one.exr one.exr 5 >out 2>log
+[ $? -eq 0 ] && grep -qx 'all 1\.0000  lowest 1\.0000  highest 1\.0000' out
+report $? 'imgerr: regions of an image have the means of themselves'
+"$imgerr" --regions one.exr one.exr -5 >out 2>log
+[ $? -eq 1 ] && grep -q 'bad clamp "-5"' log
+report $? 'imgerr: a bad clamp is named'
 "$imgerr" >out 2>log
 [ $? -eq 1 ] && grep -qi usage log
 report $? 'imgerr: usage'

@@ -3,7 +3,8 @@
    imgerr A.exr REF.exr                                    relMSE and MRAE, trimmed and untrimmed
    imgerr --compare OUT.png IMAGE.exr LABEL [IMAGE LABEL]...   side by side at one exposure
    imgerr --to-png IMAGE.exr OUT.png [EXPOSURE]             tone-mapped
-   imgerr --heat OUT.png IMAGE.exr REF.exr                  relative error per pixel: black 0, white 1 and more */
+   imgerr --heat OUT.png IMAGE.exr REF.exr                  relative error per pixel: black 0, white 1 and more
+   imgerr --regions IMAGE.exr REF.exr [CLAMP]               means of 6 x 4 regions over the reference's; any two sizes */
 #include "tracer.h"
 
 #include <errno.h>
@@ -22,11 +23,14 @@
 
 #define SEPARATOR 2 /* pixels between pictures */
 #define MAX_COLUMNS 16
+#define REGIONS_X 6
+#define REGIONS_Y 4
 
 static const char usage[] = "usage: imgerr IMAGE.exr REFERENCE.exr\n"
                             "       imgerr --compare OUT.png IMAGE.exr LABEL [IMAGE.exr LABEL]...\n"
                             "       imgerr --to-png IMAGE.exr OUT.png [EXPOSURE]\n"
-                            "       imgerr --heat OUT.png IMAGE.exr REFERENCE.exr\n";
+                            "       imgerr --heat OUT.png IMAGE.exr REFERENCE.exr\n"
+                            "       imgerr --regions IMAGE.exr REFERENCE.exr [CLAMP]\n";
 
 static int complain(const char *text, const char *remedy)
 {
@@ -152,18 +156,28 @@ static int compare(const char *out_path, char **args, int count)
     return ok ? 0 : complain(err, "check the paths, and that the folder of the output exists");
 }
 
+/* A positive number, `fallback` where there is no text; 0 after a complaint. */
+static float positive(const char *text, const char *what, float fallback)
+{
+    char err[200], *end = NULL;
+    float value = text ? strtof(text, &end) : fallback;
+    if (text && (end == text || *end || !(value > 0) || !isfinite(value))) {
+        snprintf(err, sizeof err, "bad %s \"%.100s\"", what, text);
+        complain(err, "give a positive number, or leave it out");
+        return 0;
+    }
+    return value;
+}
+
 static int to_png(const char *in_path, const char *out_path, const char *exposure_text)
 {
     tr_image image;
-    char err[512], *end = NULL;
-    float exposure = 0;
-    if (exposure_text) {
-        exposure = strtof(exposure_text, &end);
-        if (end == exposure_text || *end || !(exposure > 0) || !isfinite(exposure)) {
-            snprintf(err, sizeof err, "bad exposure \"%.100s\"", exposure_text);
-            return complain(err, "give a positive number, or leave it out");
-        }
-    }
+    char err[512];
+    float exposure = positive(exposure_text, "exposure", INFINITY);
+    if (!(exposure > 0))
+        return 1;
+    if (isinf(exposure))
+        exposure = 0; /* automatic */
     bool ok = tr_image_read(in_path, false, &image, err, sizeof err);
     ok = ok && tr_png_write(out_path, &image, exposure, err, sizeof err);
     tr_image_free(&image);
@@ -208,6 +222,42 @@ static int heat(const char *out_path, const char *image_path, const char *refere
     return ok ? 0 : complain(err, "compare pictures of one size, and check the output's folder");
 }
 
+/* Mean over channels and pixels of a region, values clamped; NaN counts as 0. */
+static double region_mean(const tr_image *image, int column, int row, float clamp)
+{
+    int x0 = image->width * column / REGIONS_X, x1 = image->width * (column + 1) / REGIONS_X;
+    int y0 = image->height * row / REGIONS_Y, y1 = image->height * (row + 1) / REGIONS_Y;
+    double sum = 0;
+    for (int y = y0; y < y1; ++y)
+        for (int i = 3 * x0; i < 3 * x1; ++i)
+            sum += fminf(fmaxf(image->data[(size_t)y * (size_t)image->width * 3 + (size_t)i], 0), clamp);
+    return sum / (3.0 * fmax((x1 - x0) * (y1 - y0), 1));
+}
+
+/* Is there a bias? Fireflies sway means: a clamp compares what lies below it (and is itself a bias of the noisier). */
+static int regions(const char *image_path, const char *reference_path, const char *clamp_text)
+{
+    tr_image image, reference;
+    float clamp = positive(clamp_text, "clamp", INFINITY);
+    if (!(clamp > 0) || !read_pair(image_path, reference_path, &image, &reference))
+        return 1;
+    double low = INFINITY, high = 0, all[2] = {0, 0};
+    for (int row = 0; row < REGIONS_Y; ++row)
+        for (int column = 0; column < REGIONS_X; ++column) {
+            double a = region_mean(&image, column, row, clamp), b = region_mean(&reference, column, row, clamp);
+            double ratio = b > 0 ? a / b : a > 0 ? INFINITY : 1;
+            low = fmin(low, ratio);
+            high = fmax(high, ratio);
+            all[0] += a;
+            all[1] += b;
+            printf("%7.4f%s", ratio, column + 1 < REGIONS_X ? " " : "\n");
+        }
+    printf("all %.4f  lowest %.4f  highest %.4f\n", all[1] > 0 ? all[0] / all[1] : 1, low, high);
+    tr_image_free(&image);
+    tr_image_free(&reference);
+    return 0;
+}
+
 int main(int argc, char **argv)
 {
     if (argc == 2 && strcmp(argv[1], "--help") == 0) {
@@ -222,6 +272,8 @@ int main(int argc, char **argv)
         return to_png(argv[2], argv[3], argc == 5 ? argv[4] : NULL);
     if (argc == 5 && strcmp(argv[1], "--heat") == 0)
         return heat(argv[2], argv[3], argv[4]);
+    if ((argc == 4 || argc == 5) && strcmp(argv[1], "--regions") == 0)
+        return regions(argv[2], argv[3], argc == 5 ? argv[4] : NULL);
     fputs(usage, stderr);
     return 1;
 }
