@@ -3,6 +3,7 @@
 #   make demo        install what is missing, build, render the ajar scene with and without guiding, compare
 #   make test        install what is missing, build, run every test
 #   make             build only           make bench       run the microbenchmarks
+#   make bench-error [PRESET=quick|full]  error against run time: tables and plots in out/bench-error
 #   make format      clang-format in place  make lint        only check
 #
 #   config=release|debug|scalar|sanitize|tsan|coverage    each has its own folder (build/, build-debug/, ...)
@@ -61,12 +62,12 @@ PROGRAMS := $(patsubst examples/tracer/%.c,$(B)/%,$(wildcard $(TRACER_MAINS:%=ex
 EXAMPLES := $(patsubst examples/%.c,$(B)/examples/%,$(wildcard examples/*.c))
 TESTS_ALL := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/test_*.c))
 BENCHES := $(patsubst bench/%.c,$(B)/%,$(wildcard bench/bench_*.c))
-# TESTS="a b" picks test_a and test_b, and "matrix", "cli"; empty = all.
+# TESTS="a b" picks test_a and test_b, and "matrix", "rig", "cli"; empty = all.
 TEST_PROGRAMS := $(if $(TESTS),$(filter $(TESTS:%=$(B)/tests/test_%),$(TESTS_ALL)),$(TESTS_ALL))
 SOURCES := $(sort $(HEADERS) $(wildcard examples/*.c examples/tracer/*.[ch] tests/*.[ch] tests/*/*.[ch] bench/*.[ch]))
 SCRIPTS := .ci/run $(wildcard tests/*.sh examples/*.sh)
 
-.PHONY: all programs deps check-deps demo test run-demo run-test expected-count bench run-bench format lint clean help
+.PHONY: all programs deps check-deps demo test run-demo run-test expected-count bench run-bench bench-error run-bench-error format lint clean help
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -196,7 +197,7 @@ check-deps:
 test: deps
 	$(SUB) run-test
 
-run-test: $(TEST_PROGRAMS) $(PROGRAMS) $(EXAMPLES)
+run-test: $(TEST_PROGRAMS) $(PROGRAMS) $(EXAMPLES) $(if $(filter release,$(config)),$(B)/bench_error)
 	@BUILD=$(B) CONFIG=$(config) CC='$(CC)' TESTS='$(TESTS)' bash tests/run.sh $(TEST_PROGRAMS)
 	$(if $(filter coverage,$(config)),@$(MAKE) --no-print-directory coverage-report)
 
@@ -223,7 +224,20 @@ bench: deps
 	$(SUB) run-bench
 
 run-bench: $(BENCHES)
-	@for b in $(BENCHES); do echo "$$b"; $$b || exit 1; done
+	@for b in $(filter-out $(B)/bench_error,$(BENCHES)); do echo "$$b"; $$b || exit 1; done
+
+# Quick: under 10 minutes on two cores. Full: an hour and a half; with GUIDE_SCENES the downloaded scenes too, hours.
+PRESET ?= quick
+PRESET_quick := --scenes ajar,lamps,torus,pool,cornell --seconds 5,20
+PRESET_full = --scenes $(shell cd examples/scenes 2>/dev/null && ls *.xml | sed 's/\.xml//' | \
+	paste -sd, -)$(if $(GUIDE_SCENES),$(comma)veach-ajar$(comma)veach-bidir$(comma)living-room$(comma)kitchen) --seconds 10,30,60
+comma := ,
+
+bench-error: deps
+	$(SUB) run-bench-error
+
+run-bench-error: $(B)/render $(B)/bench_error
+	@$(B)/bench_error $(PRESET_$(PRESET)) --out out/bench-error-$(PRESET) $(ARGS)
 
 # ---- upkeep ---------------------------------------------------------------------------------------------------
 

@@ -201,18 +201,29 @@ static int find_channel(const exr_attr_chlist_t *list, const char *prefix, size_
     return -1;
 }
 
+static const char *const rgb_names[3] = {"R", "G", "B"};
+
+/* The channels of a layer by its name; false = it has no R, G and B. */
+static bool choose_layer(const exr_attr_chlist_t *list, const char *layer, int rgb[3])
+{
+    char prefix[256];
+    int length = snprintf(prefix, sizeof prefix, "%s.", layer);
+    for (int c = 0; c < 3; ++c)
+        rgb[c] = find_channel(list, prefix, (size_t)length, rgb_names[c]);
+    return rgb[0] >= 0 && rgb[1] >= 0 && rgb[2] >= 0;
+}
+
 /* Which channels hold the colour: R, G, B; else Y; else those of the first layer that has them; else the first channel
    there is (a picture of one unnamed quantity). */
 static void choose_channels(const exr_attr_chlist_t *list, int rgb[3])
 {
-    static const char *const names[3] = {"R", "G", "B"};
     for (int layer = -1; layer < list->num_channels; ++layer) {
         const char *prefix = layer < 0 ? "" : list->entries[layer].name.str, *dot = strrchr(prefix, '.');
         size_t length = dot ? (size_t)(dot - prefix) + 1 : 0;
         if (layer >= 0 && !length)
             continue;
         for (int c = 0; c < 3; ++c)
-            rgb[c] = find_channel(list, prefix, length, names[c]);
+            rgb[c] = find_channel(list, prefix, length, rgb_names[c]);
         if (rgb[0] >= 0 && rgb[1] >= 0 && rgb[2] >= 0)
             return;
         rgb[0] = rgb[1] = rgb[2] = find_channel(list, prefix, length, "Y");
@@ -226,6 +237,7 @@ typedef struct exr_reader {
     exr_context_t context;
     exr_decode_pipeline_t decode;
     bool decode_ready;
+    const char *layer; /* NULL = the colour */
     int rgb[3];
     exr_attr_box2i_t window;
     tr_image *image;
@@ -312,7 +324,10 @@ static bool read_exr_header(exr_reader *r, const char *path, exr_storage_t *stor
     for (int i = 0; i < channels->num_channels; ++i)
         if (!channels->entries[i].name.str)
             return fail(err, err_size, "%s: damaged EXR header: a channel without a name", path);
-    choose_channels(channels, r->rgb);
+    if (!r->layer)
+        choose_channels(channels, r->rgb);
+    else if (!choose_layer(channels, r->layer, r->rgb))
+        return fail(err, err_size, "%s: no layer \"%.100s\" with R, G and B", path, r->layer);
     for (int c = 0; c < 3; ++c) {
         const exr_attr_chlist_entry_t *e = &channels->entries[r->rgb[c]];
         if (e->x_sampling != 1 || e->y_sampling != 1)
@@ -328,10 +343,11 @@ static bool read_exr_header(exr_reader *r, const char *path, exr_storage_t *stor
     return true;
 }
 
-static bool read_exr(const char *path, blob *b, tr_image *image, char *err, size_t err_size)
+static bool read_exr(const char *path, blob *b, const char *layer, tr_image *image, char *err, size_t err_size)
 {
     exr_reader r;
     memset(&r, 0, sizeof r);
+    r.layer = layer;
     r.image = image;
     exr_context_initializer_t init = EXR_DEFAULT_CONTEXT_INITIALIZER;
     init.error_handler_fn = exr_silent;
@@ -421,10 +437,19 @@ bool tr_image_read(const char *path, bool raw, tr_image *image, char *err, size_
         if (b.size == 0)
             ok = fail(err, err_size, "%s: the file is empty", path);
         else if (b.size >= 4 && memcmp(b.data, exr_magic, 4) == 0)
-            ok = read_exr(path, &b, image, err, err_size);
+            ok = read_exr(path, &b, NULL, image, err, err_size);
         else
             ok = read_stb(path, &b, raw, image, err, err_size);
     }
+    free(b.data);
+    return ok;
+}
+
+bool tr_exr_read_layer(const char *path, const char *layer, tr_image *image, char *err, size_t err_size)
+{
+    blob b = {0};
+    memset(image, 0, sizeof *image);
+    bool ok = blob_read_file(&b, path, err, err_size) && read_exr(path, &b, layer, image, err, err_size);
     free(b.data);
     return ok;
 }

@@ -1,0 +1,97 @@
+#!/usr/bin/env bash
+# Does the measuring rig see what it is for? One renderer against itself must pass; against one that takes twice the time,
+# and against one whose light is 3 % too bright, flags must go up; a renderer that crashes must not stop the rest; an
+# interrupted run must go on. Speaks TAP.
+export LC_ALL=C
+cd "$(dirname "$0")/.." || exit 1
+build=${BUILD:-build}
+rig=$build/bench_error render=$build/render
+tmp=$(mktemp -d) || exit 1
+trap 'rm -rf "$tmp"' EXIT
+count=0 bad=0
+
+report() { # report STATUS NAME
+    count=$((count + 1))
+    if [ "$1" -eq 0 ]; then
+        echo "ok $count - $2"
+    else
+        bad=$((bad + 1))
+        echo "not ok $count - $2"
+        tail -n 15 "$tmp/log" | sed 's/^/# /'
+    fi
+}
+
+# Half the budget, and twice the time said to be spent: what a renderer of half the speed would do.
+cat >"$tmp/slow" <<SH
+#!/usr/bin/env bash
+arguments=() json=
+while [ \$# -gt 0 ]; do
+    case \$1 in
+    --seconds) arguments+=("\$1" "\$(awk "BEGIN { print \$2 / 2 }")") && shift ;;
+    --json) json=\$2 && arguments+=("\$1" "\$2") && shift ;;
+    *) arguments+=("\$1") ;;
+    esac
+    shift
+done
+"$render" "\${arguments[@]}" || exit 1
+awk '/"cpu_seconds": [0-9.]+,\$/ && !done { sub(/[0-9.]+,\$/, 2 * \$2 ","); done = 1 } { print }' "\$json" >"\$json.new" &&
+    mv "\$json.new" "\$json"
+SH
+cat >"$tmp/bright" <<SH
+#!/usr/bin/env bash
+sed 's/"12, 10.5, 8"/"12.36, 10.815, 8.24"/' examples/scenes/cornell.xml >"$tmp/bright\$\$.xml"
+shift
+exec "$render" "$tmp/bright\$\$.xml" "\$@"
+SH
+cat >"$tmp/crash" <<SH
+#!/usr/bin/env bash
+case " \$* " in *" sdtree "*) kill -SEGV \$\$ ;; esac
+exec "$render" "\$@"
+SH
+chmod +x "$tmp/slow" "$tmp/bright" "$tmp/crash"
+"$render" examples/scenes/cornell.xml --spp 64 --size 160x90 --quiet -o "$tmp/cornell.exr" || exit 1
+
+# rig NAME BUILD ARGUMENTS...: status in $status, words in $tmp/log.
+measure() {
+    local out=$tmp/out-$1 other=$2
+    shift 2
+    "$rig" --scenes cornell --size 160x90 --references "$tmp" --builds "a=$render,b=$other" --out "$out" "$@" \
+        >"$tmp/log" 2>&1
+    status=$?
+}
+
+measure same "$render" --seconds 2 --seeds 3 --methods pt
+[ $status -eq 0 ] && ! grep -qE 'SLOWER|BIASED|WORSE' "$tmp/log"
+report $? 'a renderer against itself: no flag'
+measure slow "$tmp/slow" --seconds 2 --seeds 3 --methods pt
+[ $status -eq 2 ] && grep -q SLOWER "$tmp/log" && ! grep -q BIASED "$tmp/log"
+report $? 'half the speed: called slower, not biased'
+measure bright "$tmp/bright" --seconds 2 --seeds 3 --methods pt,sdtree
+[ $status -eq 2 ] && [ "$(grep -c BIASED "$tmp/log")" -eq 2 ] && ! grep -q SLOWER "$tmp/log"
+report $? 'light 3 % too bright: called biased for both methods, not slower'
+measure crash "$tmp/crash" --spp 4 --seeds 1 --methods pt,sdtree
+[ "$(grep -c ',ok,' "$tmp/out-crash/rows.csv")" -eq 3 ] && grep -q ',b,sdtree,4spp,1,signal 11,' "$tmp/out-crash/rows.csv"
+report $? 'a crash marks its row and the rest goes on'
+
+# Cut a row in half, as a lost machine would: it is rendered again, the others are not.
+csv=$tmp/out-same/rows.csv
+cp "$csv" "$tmp/whole.csv"
+head -c -20 "$tmp/whole.csv" >"$csv"
+measure same "$render" --seconds 2 --seeds 3 --methods pt
+grep -q '^1 renders to do' "$tmp/log" && [ "$(wc -l <"$csv")" -eq "$(wc -l <"$tmp/whole.csv")" ] &&
+    [ "$(head -n -1 "$csv")" = "$(head -n -1 "$tmp/whole.csv")" ]
+report $? 'an interrupted run goes on where it stopped'
+measure same "$render" --seconds 2 --seeds 3 --methods pt --max-depth 5
+[ $status -eq 1 ] && grep -q 'made with other settings' "$tmp/log"
+report $? 'rows of other settings are not mixed'
+"$rig" --scenes nowhere --out "$tmp/out-none" >"$tmp/log" 2>&1
+[ $? -eq 1 ] && grep -q 'no such scene.*nowhere' "$tmp/log"
+report $? 'a scene that is not there is named'
+for picture in error-seconds-cornell error-spp-cornell cost; do
+    grep -q '</svg>' "$tmp/out-same/$picture.svg" || status=9
+done
+[ $status -ne 9 ] && grep -q '"relmse": ' "$tmp/out-same/rows.json" && grep -q '^| cornell | 2s | pt (b) |' "$tmp/out-same/table.md"
+report $? 'plots, JSON and a table are written'
+
+echo "1..$count"
+[ "$bad" -eq 0 ]
