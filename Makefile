@@ -3,7 +3,8 @@
 #   make demo        install what is missing, build, render the ajar scene with and without guiding, compare
 #   make test        install what is missing, build, run every test
 #   make             build only           make bench       run the microbenchmarks
-#   make bench-error [PRESET=quick|full]  error against run time: tables and plots in out/bench-error
+#   make bench-readme                     put the last bench's figures into the README
+#   make bench-error [PRESET=quick|full]  error against run time: tables and plots in out/bench-error-PRESET
 #   make format      clang-format in place  make lint        only check
 #
 #   config=release|debug|scalar|sanitize|tsan|coverage    each has its own folder (build/, build-debug/, ...)
@@ -61,13 +62,14 @@ TRACER_OBJ := $(TRACER_SRC:examples/tracer/%.c=$(B)/obj/tracer/%.o)
 PROGRAMS := $(patsubst examples/tracer/%.c,$(B)/%,$(wildcard $(TRACER_MAINS:%=examples/tracer/%.c)))
 EXAMPLES := $(patsubst examples/%.c,$(B)/examples/%,$(wildcard examples/*.c))
 TESTS_ALL := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/test_*.c))
+MICRO := $(B)/bench_sdtree
 BENCHES := $(patsubst bench/%.c,$(B)/%,$(wildcard bench/bench_*.c))
 # TESTS="a b" picks test_a and test_b, and "matrix", "rig", "cli"; empty = all.
 TEST_PROGRAMS := $(if $(TESTS),$(filter $(TESTS:%=$(B)/tests/test_%),$(TESTS_ALL)),$(TESTS_ALL))
 SOURCES := $(sort $(HEADERS) $(wildcard examples/*.c examples/tracer/*.[ch] tests/*.[ch] tests/*/*.[ch] bench/*.[ch]))
-SCRIPTS := .ci/run $(wildcard tests/*.sh examples/*.sh)
+SCRIPTS := .ci/run $(wildcard tests/*.sh examples/*.sh bench/*.sh)
 
-.PHONY: all programs deps check-deps demo test run-demo run-test expected-count bench run-bench bench-error run-bench-error format lint clean help
+.PHONY: all programs deps check-deps demo test run-demo run-test expected-count bench run-bench bench-readme bench-error run-bench-error format lint clean help
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -224,7 +226,14 @@ bench: deps
 	$(SUB) run-bench
 
 run-bench: $(BENCHES)
-	@for b in $(filter-out $(B)/bench_error,$(BENCHES)); do echo "$$b"; $$b || exit 1; done
+	@mkdir -p out
+	@BENCH_FLAGS='$(CFLAGS_ALL)' BENCH_COMMIT="$$(git describe --always --dirty 2>/dev/null)"; \
+	export BENCH_FLAGS BENCH_COMMIT; \
+	for b in $(MICRO); do echo "$$b"; $$b --json out/$${b##*/}.json $(ARGS) || exit 1; done
+
+# Put the figures of the last `make bench` into the README.
+bench-readme:
+	@sh bench/readme.sh README.md $(MICRO:$(B)/%=out/%.json)
 
 # Quick: under 10 minutes on two cores. Full: an hour and a half; with GUIDE_SCENES the downloaded scenes too, hours.
 PRESET ?= quick

@@ -1,5 +1,5 @@
-/* bench.h: timing and machine limits shared by the microbenchmarks. Every figure is the minimum of several repeats and
-   is printed next to a limit measured in the same run: the machine may be shared. */
+/* bench.h: timing and machine limits shared by the microbenchmarks. Every figure is the minimum of several repeats,
+   with their median and spread, and is printed next to a limit measured in the same run: the machine may be shared. */
 #ifndef BENCH_H
 #define BENCH_H
 
@@ -9,12 +9,56 @@
 #include <string.h>
 #include <time.h>
 
+#if defined(__x86_64__) && defined(__GNUC__)
+#include <immintrin.h>
+#define BENCH_X86 1
+#endif
+
 static inline double bench_seconds(void)
 {
     struct timespec t;
     clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
     return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
 }
+
+/* Times of several repeats, per item, in nanoseconds. */
+typedef struct bench_time {
+    double min, median;
+    double spread; /* (third quartile - first quartile) / median */
+} bench_time;
+
+static inline int bench_compare(const void *a, const void *b)
+{
+    double x = *(const double *)a, y = *(const double *)b;
+    return (x > y) - (x < y);
+}
+
+/* Sorts the times. */
+static inline bench_time bench_summary(double *times, int n)
+{
+    bench_time t = {0, 0, 0};
+    if (n < 1)
+        return t;
+    qsort(times, (size_t)n, sizeof *times, bench_compare);
+    t.min = times[0];
+    t.median = 0.5 * (times[(n - 1) / 2] + times[n / 2]);
+    t.spread = (times[3 * (n - 1) / 4] - times[(n - 1) / 4]) / t.median;
+    return t;
+}
+
+/* Run `body` `repeats` times, at most BENCH_REPEATS; all times go into one summary. */
+#define BENCH_REPEATS 64
+#define BENCH_TIME(result, repeats, items, body)                                                                       \
+    do {                                                                                                               \
+        double bench_times[BENCH_REPEATS];                                                                             \
+        int bench_n = (repeats) < BENCH_REPEATS ? (repeats) : BENCH_REPEATS;                                           \
+        for (int bench_i = 0; bench_i < bench_n; ++bench_i) {                                                          \
+            double bench_start = bench_seconds();                                                                      \
+            body;                                                                                                      \
+            bench_times[bench_i] = (bench_seconds() - bench_start) * 1e9 / (double)(items);                            \
+        }                                                                                                              \
+        (result) = bench_summary(bench_times, bench_n);                                                                \
+    } while (0)
 
 /* Run `body` `repeats` times; the smallest time per item in nanoseconds. */
 #define BENCH_MIN_NS(result, repeats, items, body)                                                                     \
@@ -23,8 +67,8 @@ static inline double bench_seconds(void)
         for (int bench_i = 0; bench_i < (repeats); ++bench_i) {                                                        \
             double bench_start = bench_seconds();                                                                      \
             body;                                                                                                      \
-            double bench_time = bench_seconds() - bench_start;                                                         \
-            bench_best = bench_time < bench_best ? bench_time : bench_best;                                            \
+            double bench_took = bench_seconds() - bench_start;                                                         \
+            bench_best = bench_took < bench_best ? bench_took : bench_best;                                            \
         }                                                                                                              \
         (result) = bench_best * 1e9 / (double)(items);                                                                 \
     } while (0)
@@ -119,10 +163,72 @@ static inline double bench_read_bandwidth(void)
     return ns > 0 ? 1 / ns : 0;
 }
 
-/* What was measured, on what: the first lines of every benchmark. */
-static inline void bench_print_machine(void)
+#ifdef BENCH_X86
+__attribute__((target("avx2,fma"))) static inline float bench_fma_chains(size_t steps)
+{
+    __m256 a[12], x = _mm256_set1_ps(0.999f), y = _mm256_set1_ps(0.001f);
+    float out[8];
+    for (int k = 0; k < 12; ++k)
+        a[k] = _mm256_set1_ps((float)k);
+    for (size_t i = 0; i < steps; ++i)
+        for (int k = 0; k < 12; ++k)
+            a[k] = _mm256_fmadd_ps(a[k], x, y);
+    for (int k = 1; k < 12; ++k)
+        a[0] = _mm256_add_ps(a[0], a[k]);
+    _mm256_storeu_ps(out, a[0]);
+    return out[0];
+}
+#endif
+
+/* Fused multiply-adds in single precision on one core, GFLOP/s (two operations each); 0 = not measured here. */
+static inline double bench_fma_peak(void)
+{
+#ifdef BENCH_X86
+    size_t steps = 1 << 20;
+    double ns;
+    if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma"))
+        return 0;
+    BENCH_MIN_NS(ns, 6, steps * 12 * 8 * 2, {
+        float sum = bench_fma_chains(steps);
+        bench_use(&sum);
+    });
+    return 1 / ns;
+#else
+    return 0;
+#endif
+}
+
+/* Milliseconds to copy a matrix of 2048 x 2048 floats, past the caches where the machine can. */
+static inline double bench_copy_ms(void)
+{
+    size_t bytes = (size_t)2048 * 2048 * 4;
+    char *from = aligned_alloc(64, bytes), *to = aligned_alloc(64, bytes);
+    double ns = 0;
+    if (from && to) {
+        memset(from, 1, bytes);
+        memset(to, 2, bytes);
+        BENCH_MIN_NS(ns, 10, 1, {
+#ifdef BENCH_X86
+            for (size_t i = 0; i < bytes; i += 16)
+                _mm_stream_si128((__m128i *)(void *)(to + i),
+                                 _mm_load_si128((const __m128i *)(const void *)(from + i)));
+            _mm_sfence();
+#else
+            memcpy(to, from, bytes);
+#endif
+            bench_use(to);
+        });
+    }
+    free(from);
+    free(to);
+    return ns * 1e-6;
+}
+
+/* What was measured, on what: the first lines of every benchmark. The Makefile tells flags and commit. */
+static inline void bench_print_machine(FILE *json)
 {
     char line[256], cpu[200] = "unknown CPU";
+    const char *flags = getenv("BENCH_FLAGS"), *commit = getenv("BENCH_COMMIT"), *compiler = "unknown";
     FILE *f = fopen("/proc/cpuinfo", "r");
     while (f && fgets(line, sizeof line, f))
         if (!strncmp(line, "model name", 10) && strchr(line, ':')) {
@@ -132,14 +238,26 @@ static inline void bench_print_machine(void)
         }
     if (f)
         fclose(f);
-#if defined(__VERSION__)
-    printf("machine: %s; compiler: %s\n", cpu, __VERSION__);
-#else
-    printf("machine: %s\n", cpu);
+#if defined(__clang__)
+    compiler = __VERSION__; /* names itself */
+#elif defined(__GNUC__)
+    compiler = "gcc " __VERSION__;
 #endif
-    printf("limits:  random load 256 KB %.1f ns, 4 MB %.1f ns, 64 MB %.1f ns; memory read %.1f GB/s\n",
-           bench_load_latency((size_t)1 << 18), bench_load_latency((size_t)1 << 22),
-           bench_load_latency((size_t)1 << 26), bench_read_bandwidth());
+    double small = bench_load_latency((size_t)1 << 18), middle = bench_load_latency((size_t)1 << 22);
+    double large = bench_load_latency((size_t)1 << 26), read = bench_read_bandwidth();
+    double fma = bench_fma_peak(), copy = bench_copy_ms();
+    printf("machine: %s; %s; flags: %s; commit: %s\n", cpu, compiler, flags ? flags : "not told",
+           commit ? commit : "not told");
+    printf(
+        "limits:  FMA %.0f GFLOP/s; copy of 2048^2 floats %.2f ms; memory read %.1f GB/s; random load 256 KB %.1f ns, "
+        "4 MB %.1f ns, 64 MB %.1f ns\n",
+        fma, copy, read, small, middle, large);
+    if (json)
+        fprintf(json,
+                "{\"machine\": {\"cpu\": \"%s\", \"compiler\": \"%s\", \"flags\": \"%s\", \"commit\": \"%s\", "
+                "\"fma_gflops\": %.1f, \"copy_ms\": %.3f, \"read_gb_s\": %.1f, \"load_ns\": [%.1f, %.1f, %.1f]},\n"
+                "\"rows\": [",
+                cpu, compiler, flags ? flags : "", commit ? commit : "", fma, copy, read, small, middle, large);
 }
 
 #endif

@@ -57,16 +57,24 @@ static FILE *json_file;
 static int json_rows;
 
 /* limit and naive in ns; target 0 = none. */
-static void row(const char *name, double ns, double limit, double naive, double target)
+static void row(const char *name, bench_time t, double limit, double naive, double target)
 {
-    printf("%-44s %8.1f %8.1f %6.2fx %8.1f %6.2fx", name, ns, limit, ns / limit, naive, naive / ns);
+    printf("%-44s %8.1f %8.1f %5.0f%% %8.1f %6.2fx %8.1f %6.2fx", name, t.min, t.median, 100 * t.spread, limit,
+           t.min / limit, naive, naive / t.min);
     if (target > 0)
-        printf("   <= %3.0f %s", target, ns <= target ? "reached" : "missed");
+        printf("   <= %3.0f %s", target, t.min <= target ? "reached" : "missed");
     printf("\n");
     if (json_file)
         fprintf(json_file,
-                "%s\n  {\"name\": \"%s\", \"ns\": %.2f, \"limit_ns\": %.2f, \"naive_ns\": %.2f, \"target_ns\": %.0f}",
-                json_rows++ ? "," : "[", name, ns, limit, naive, target);
+                "%s\n  {\"name\": \"%s\", \"ns\": %.2f, \"median_ns\": %.2f, \"spread\": %.3f, \"limit_ns\": %.2f, "
+                "\"naive_ns\": %.2f, \"target_ns\": %.0f}",
+                json_rows++ ? "," : "", name, t.min, t.median, t.spread, limit, naive, target);
+}
+
+static void row_titles(const char *what)
+{
+    printf("%-44s %8s %8s %6s %8s %7s %8s %7s   target\n", what, "min", "median", "spread", "limit", "ratio", "naive",
+           "faster");
 }
 
 /* ---- the field of the queries ------------------------------------------------------------------------------- */
@@ -313,18 +321,18 @@ static void pdf_guided_batch(const gsd_view *v, const queries *q, uint32_t at, u
 
 typedef void (*query_fn)(const gsd_view *v, const queries *q, uint32_t at, uint32_t n, results *r);
 
-static double time_queries(const options *o, query_fn fn, const gsd_view *v, const queries *q)
+static bench_time time_queries(const options *o, query_fn fn, const gsd_view *v, const queries *q)
 {
-    double ns;
+    bench_time time;
     results *r = allocate(1, sizeof *r);
-    BENCH_MIN_NS(ns, o->repeats, q->count, {
+    BENCH_TIME(time, o->repeats, q->count, {
         for (uint32_t at = 0; at < q->count; at += BATCH) {
             fn(v, q, at, q->count - at < BATCH ? q->count - at : BATCH, r);
             bench_use(r);
         }
     });
     free(r);
-    return ns;
+    return time;
 }
 
 enum { NAIVE_FIND, NAIVE_SAMPLE, NAIVE_PDF, NAIVE_PDF_GUIDED };
@@ -465,7 +473,7 @@ static void bench_queries(const options *o, const gsd_view *v, const gsd_view *a
         "       the field's size (%.1f ns); batched, the time of independent loads there (%.1f ns); sorted, in cache\n"
         "       (%.1f ns)\n\n",
         l.find - 1, l.depth_guided, l.depth_uniform, m->latency, m->throughput, m->cached);
-    printf("%-44s %8s %8s %7s %8s %7s   target\n", "ns per query", "ns", "limit", "ratio", "naive", "faster");
+    row_titles("ns per query");
     row("find, one by one", time_queries(o, find_scalar, v, q), m->latency * l.find, naive[0], 0);
     row("find, batched", time_queries(o, find_batch, v, q), m->throughput * l.find, naive[0], 0);
     row("find + sample, one by one", time_queries(o, sample_scalar, v, q), m->latency * monotone, naive[1], 0);
@@ -619,21 +627,24 @@ static void bench_learning(const options *o, const machine *m)
         "\nlearning SF1, 2^%d samples in %d updates; limit: four passes over the 48 bytes of a sample at %.1f GB/s\n",
         log2n, SF1_UPDATES, m->bandwidth);
     validate_learning(o);
+    row_titles("ns per sample");
     double naive_ns = 0;
     gsd_desc resolved;
     check(gsd_resolve(&o->desc, &resolved), "resolve");
     naive_learner naive = naive_create(1000, (double)resolved.rho);
     for (int k = 0; k < 2; ++k) {
         gsd_stats stats;
-        double best = 1e30;
+        double best = 1e30, times[5];
         learning t, fastest = {0, 0, 0, 1};
-        for (int repeat = 0; repeat < (o->quick ? 1 : 3); ++repeat) {
+        int repeats = o->quick ? 1 : 5;
+        for (int repeat = 0; repeat < repeats; ++repeat) {
             gsd_desc desc = o->desc;
             desc.target = kind[k].target;
             bool first = k == 0 && repeat == 0;
             gsd_field *field = learn(&desc, log2n, 1, 0, &t, first ? &naive : NULL, &naive_ns);
             naive_ns *= first ? 1e9 / (double)t.samples : 1; /* were seconds */
             double ns = (t.record + t.accumulate + t.refine) / (double)t.samples * 1e9;
+            times[repeat] = ns;
             if (ns < best) {
                 best = ns;
                 fastest = t;
@@ -641,7 +652,7 @@ static void bench_learning(const options *o, const machine *m)
             gsd_get_stats(field, &stats);
             gsd_destroy(field);
         }
-        row(kind[k].name, best, 4 * 48 / m->bandwidth, naive_ns, 80);
+        row(kind[k].name, bench_summary(times, repeats), 4 * 48 / m->bandwidth, naive_ns, 80);
         printf("    record %.1f, accumulate %.1f, refine %.1f ns/sample; %u cells, %.0f nodes and %.0f bytes per cell, "
                "%.1f bytes per node; mean depth %.1f\n",
                fastest.record / (double)fastest.samples * 1e9, fastest.accumulate / (double)fastest.samples * 1e9,
@@ -794,13 +805,13 @@ int main(int argc, char **argv)
     parse(argc, argv, &o);
     o.repeats = o.quick ? 2 : 12;
     o.queries = o.quick ? 1 << 16 : 1 << 18;
-    bench_print_machine();
+    bench_print_machine(json_file);
     if (o.sf1)
         run_sf1(&o);
     else
         run_micro(&o);
     if (json_file) {
-        fprintf(json_file, "\n]\n");
+        fprintf(json_file, "\n]}\n");
         fclose(json_file);
     }
     return 0;
