@@ -196,7 +196,7 @@ check-deps:
 test: deps
 	$(SUB) run-test
 
-run-test: $(TEST_PROGRAMS) $(PROGRAMS) $(EXAMPLES)
+run-test: $(TEST_PROGRAMS) $(PROGRAMS) $(EXAMPLES) $(B)/bench_field
 	@BUILD=$(B) CONFIG=$(config) CC='$(CC)' TESTS='$(TESTS)' bash tests/run.sh $(TEST_PROGRAMS)
 	$(if $(filter coverage,$(config)),@$(MAKE) --no-print-directory coverage-report)
 

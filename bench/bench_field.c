@@ -196,11 +196,12 @@ static line_fit fit_line(const double *x, const double *y, int n)
 }
 
 /* A cost that is at most logarithmic rises by no more per doubling late than early. True where it rises by more than
-   half again as much, a twentieth of the cost and twice the error of the slope: noise stays below this, the square root
-   of the samples does not. */
+   half again as much, a twentieth of the cost and twice the error of the slope. Simulated with 10 % of noise and the
+   default seven sizes: the square root of the samples is found in 82 of 100 runs, with eight or more in all; a
+   logarithm is mistaken in 1 of 100. */
 static bool accelerates(const double *log2n, const double *y, int n, double *early, double *late)
 {
-    int half = n / 2 + 1;
+    int half = (n + 1) / 2;
     double mean = 0;
     line_fit first = fit_line(log2n, y, half), last = fit_line(log2n + n - half, y + n - half, half);
     for (int i = 0; i < n; ++i)
@@ -210,24 +211,25 @@ static bool accelerates(const double *log2n, const double *y, int n, double *ear
     return last.slope - 2 * last.error > 1.5 * fmax(first.slope, 0) + 0.05 * mean;
 }
 
-/* Caches end at some size, and a random load costs more from there on, for any method: a time counts as worse than
-   logarithmic only where it is so also in units of such a load. */
+/* Caches end at some size, and beyond it any method waits for memory: the time that LOADS random loads have become
+   longer is taken out before a cost counts as worse than logarithmic. */
+#define LOADS 3
 static bool judge_time(const char *name, const growth *g, const double *ns, double *line)
 {
-    double early, late, early_loads, late_loads, loads[GROWTH_SIZES];
+    double early, late, early_less, late_less, less[GROWTH_SIZES];
     line_fit f = fit_line(g->log2, ns, g->count);
     for (int i = 0; i < g->count; ++i) {
         line[i] = f.at + f.slope * g->log2[i];
-        loads[i] = ns[i] / g->load[i];
+        less[i] = ns[i] - LOADS * fmax(g->load[i] - g->load[0], 0);
     }
     bool worse = accelerates(g->log2, ns, g->count, &early, &late);
-    bool worse_loads = accelerates(g->log2, loads, g->count, &early_loads, &late_loads);
-    printf("  %s: %+.1f ns per doubling (%+.1f in the first half, %+.1f in the second; in random loads %+.2f, %+.2f): ",
-           name, f.slope, early, late, early_loads, late_loads);
-    printf("%s\n", worse && worse_loads ? "WORSE than logarithmic"
-                   : worse              ? "logarithmic or better, but for the cost of a random load"
-                                        : "logarithmic or better");
-    return !(worse && worse_loads);
+    bool worse_less = accelerates(g->log2, less, g->count, &early_less, &late_less);
+    printf("  %s: %+.1f ns per doubling; first half %+.1f, second %+.1f (less the wait for memory: %+.1f, %+.1f): %s\n",
+           name, f.slope, early, late, early_less, late_less,
+           worse && worse_less ? "WORSE than logarithmic"
+           : worse             ? "logarithmic or better but for memory's latency"
+                               : "logarithmic or better");
+    return !(worse && worse_less);
 }
 
 /* Blank where there is no value. */
@@ -395,7 +397,7 @@ static void usage(FILE *f)
           "  --samples 14,17,20    log2 of the numbers of samples\n"
           "  --seeds 5             of which the mean is taken\n"
           "  --exact               weights without noise\n"
-          "  --max-log2 22         largest number of samples of --growth, 18 to 26\n"
+          "  --max-log2 22         log2 of the largest number of samples of --growth, 20 to 26\n"
           "  --plot DIRECTORY      write growth-*.svg there\n"
           "  --json FILE           write all rows\n"
           "methods:\n",
@@ -472,7 +474,7 @@ static bool parse_value(options *o, const char *option, const char *value)
     else if (!strcmp(option, "--seeds"))
         o->seeds = parse_number(option, value, 1, 1000);
     else if (!strcmp(option, "--max-log2"))
-        o->max_log2 = parse_number(option, value, GROWTH_MIN_LOG2 + 2, 26);
+        o->max_log2 = parse_number(option, value, GROWTH_MIN_LOG2 + 4, 26);
     else if (!strcmp(option, "--plot"))
         o->plot = value;
     else if (!strcmp(option, "--json"))

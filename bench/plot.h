@@ -73,7 +73,7 @@ static inline plot_axis plot_make_axis(const plot_series *series, int count, boo
         }
     if (!(a.low <= a.high))
         a.low = 0, a.high = 1;
-    double pad = 0.03 * (a.high - a.low), least = a.log ? 0.15 : 1e-6 * fmax(fabs(a.low), fabs(a.high));
+    double pad = 0.03 * (a.high - a.low), least = a.log ? 0.4 : 1e-6 * fmax(fabs(a.low), fabs(a.high));
     if (!a.log && a.high - a.low <= least)
         pad = a.low == 0 ? 1 : 0.5 * fabs(a.low);
     else if (a.log && pad < 0.05)
