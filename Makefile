@@ -199,7 +199,7 @@ check-deps:
 test: deps
 	$(SUB) run-test
 
-run-test: $(TEST_PROGRAMS) $(PROGRAMS) $(EXAMPLES) $(if $(filter release,$(config)),$(B)/bench_error)
+run-test: $(TEST_PROGRAMS) $(PROGRAMS) $(EXAMPLES) $(B)/bench_field $(if $(filter release,$(config)),$(B)/bench_error)
 	@BUILD=$(B) CONFIG=$(config) CC='$(CC)' TESTS='$(TESTS)' bash tests/run.sh $(TEST_PROGRAMS)
 	$(if $(filter coverage,$(config)),@$(MAKE) --no-print-directory coverage-report)
 

@@ -1,7 +1,6 @@
-/* bench_sdtree: what the SD-tree's queries and learning cost, and how well it learns the field SF1.
+/* bench_sdtree: what the SD-tree's queries and learning cost. (How well it learns: bench_field.)
 
-     build/bench_sdtree [--quick] [--json FILE]              microbenchmarks
-     build/bench_sdtree --sf1 [--exact] [--seeds N] [--min-log2 N] [--max-log2 N] [--set key=value]...
+     build/bench_sdtree [--quick] [--json FILE] [--set key=value]...
 
    Every figure is checked against the naive tree of sdtree_naive.h before it is timed, and printed as a ratio to it and
    to a limit that this run measured. */
@@ -16,8 +15,8 @@
 #define BATCH 4096
 
 typedef struct options {
-    bool quick, sf1, exact;
-    int seeds, min_log2, max_log2, repeats;
+    bool quick;
+    int repeats;
     uint32_t queries;
     FILE *json;
     gsd_desc desc; /* as the command line changed it */
@@ -92,7 +91,7 @@ static uint32_t draw_samples(sf1_rng *rng, uint32_t n, int update, int exact, gs
     uint32_t count = 0;
     sf1_sample s;
     for (uint32_t i = 0; i < n; ++i)
-        if (sf1_draw(rng, update, exact, &s))
+        if (sf1_draw(&sf1_default, rng, update, exact, &s))
             out[count++] = to_training(&s);
     return count;
 }
@@ -194,7 +193,7 @@ static queries make_queries(uint32_t count, const gsd_view *view)
         sf1_point p;
         double w[3];
         static const double up[3] = {0, 0, 1};
-        sf1_make_point(&rng, &p);
+        sf1_make_point(&sf1_default, &rng, &p);
         sf1_around(up, 2 * sf1_uniform(&rng) - 1, sf1_uniform(&rng), w);
         for (int k = 0; k < 3; ++k) {
             q.position[3 * i + k] = (float)p.x[k];
@@ -523,7 +522,7 @@ static void fill_pdf_guide(const gsd_field *field, gsd_training_sample *samples,
 }
 
 /* Learn SF1 from about 2^log2n samples in SF1_UPDATES equal updates. naive may be NULL: it gets the same samples. */
-static gsd_field *learn(const gsd_desc *desc, int log2n, uint64_t seed, int exact, learning *t, naive_learner *naive,
+static gsd_field *learn(const gsd_desc *desc, int log2n, uint64_t seed, learning *t, naive_learner *naive,
                         double *naive_seconds)
 {
     gsd_field *field;
@@ -535,7 +534,7 @@ static gsd_field *learn(const gsd_desc *desc, int log2n, uint64_t seed, int exac
     check(gsd_create(desc, &field), "create");
     check(gsd_stream_create(field, &stream), "stream");
     for (int update = 0; update < SF1_UPDATES; ++update) {
-        uint32_t count = draw_samples(&rng, n, update, exact, samples), i;
+        uint32_t count = draw_samples(&rng, n, update, 0, samples), i;
         fill_pdf_guide(field, samples, count);
         double time = bench_seconds();
         for (i = 0; i < count; i += 64)
@@ -565,19 +564,6 @@ static gsd_field *learn(const gsd_desc *desc, int log2n, uint64_t seed, int exac
     return field;
 }
 
-static double field_pdf(void *user, const sf1_point *point, const double *direction, int cosine)
-{
-    const gsd_view *view = user;
-    float p[3], n[3], w[3];
-    for (int k = 0; k < 3; ++k) {
-        p[k] = (float)point->x[k];
-        n[k] = (float)point->n[k];
-        w[k] = (float)direction[k];
-    }
-    gsd_handle h = gsd_find(view, p, cosine ? n : NULL, NULL);
-    return (double)gsd_pdf(view, &h, w);
-}
-
 /* In one cell, without filters and history, the field and the naive learner must learn the same density. */
 static void validate_learning(const options *o)
 {
@@ -595,7 +581,7 @@ static void validate_learning(const options *o)
     desc.spatial_filter = GSD_SPATIAL_NEAREST;
     desc.no_history = desc.no_gate = true;
     desc.smoothing = 0.001f; /* the naive one takes shares as they are */
-    gsd_field *field = learn(&desc, 17, 1, 0, &t, &naive, &seconds);
+    gsd_field *field = learn(&desc, 17, 1, &t, &naive, &seconds);
     gsd_view view = gsd_get_view(field);
     gsd_handle handle = gsd_find(&view, middle, NULL, NULL);
     for (uint32_t i = 0; i < n; ++i) {
@@ -641,7 +627,7 @@ static void bench_learning(const options *o, const machine *m)
             gsd_desc desc = o->desc;
             desc.target = kind[k].target;
             bool first = k == 0 && repeat == 0;
-            gsd_field *field = learn(&desc, log2n, 1, 0, &t, first ? &naive : NULL, &naive_ns);
+            gsd_field *field = learn(&desc, log2n, 1, &t, first ? &naive : NULL, &naive_ns);
             naive_ns *= first ? 1e9 / (double)t.samples : 1; /* were seconds */
             double ns = (t.record + t.accumulate + t.refine) / (double)t.samples * 1e9;
             times[repeat] = ns;
@@ -688,49 +674,6 @@ static void run_micro(const options *o)
     bench_learning(o, &m);
 }
 
-/* ---- SF1 ---------------------------------------------------------------------------------------------------- */
-
-static void run_sf1(const options *o)
-{
-    double previous = 1e30;
-    bool falls = true, reached = false;
-    printf("SF1, %s weights, %d seeds, %d updates, target radiance\n%8s %8s %8s %10s %8s %8s %9s  target A; C\n",
-           o->exact ? "exact" : "noisy", o->seeds, SF1_UPDATES, "samples", "A", "C", "ns/sample", "cells", "nodes",
-           "bytes");
-    for (int log2n = o->min_log2; log2n <= o->max_log2; ++log2n) {
-        sf1_score mean = {0, 0};
-        gsd_stats stats;
-        double ns = 1e30;
-        for (int seed = 0; seed < o->seeds; ++seed) {
-            learning t;
-            gsd_field *field = learn(&o->desc, log2n, 1000 + (uint64_t)seed, o->exact, &t, NULL, NULL);
-            gsd_view view = gsd_get_view(field);
-            sf1_score score = sf1_evaluate(field_pdf, &view, 5000 + (uint64_t)seed, SF1_POINTS, SF1_DIRECTIONS);
-            double time = (t.record + t.accumulate + t.refine) / (double)t.samples * 1e9;
-            mean.a += score.a / o->seeds;
-            mean.c += score.c / o->seeds;
-            ns = time < ns ? time : ns;
-            gsd_get_stats(field, &stats);
-            gsd_destroy(field);
-        }
-        printf("    2^%-2d %8.3f %8.3f %10.1f %8u %8.0f %9.0f", log2n, mean.a, mean.c, ns, stats.cells,
-               (double)stats.nodes / stats.cells, (double)stats.bytes);
-        double a = log2n == 14 ? 12 : log2n == 17 ? 5 : log2n == 20 ? 2.5 : 0;
-        double c = log2n == 14 ? 5 : log2n == 17 ? 3.3 : 2.2;
-        if (a > 0 && !o->exact)
-            printf("  %g; %g %s", a, c, mean.a <= a && mean.c <= c ? "reached" : "missed");
-        printf("\n");
-        fflush(stdout);
-        falls = falls && (log2n <= 18 || mean.a < previous);
-        previous = mean.a;
-        reached = log2n == 24 && mean.a <= 1.5;
-    }
-    if (o->exact)
-        printf("A <= 1.5 at 2^24: %s; falls from 2^18 on: %s\n", reached ? "reached" : "missed", falls ? "yes" : "no");
-    else
-        printf("(The targets are for a field with denoising, which this version does not have.)\n");
-}
-
 /* ---- command line ------------------------------------------------------------------------------------------- */
 
 static void set_option(gsd_desc *d, const char *text)
@@ -769,18 +712,8 @@ static void parse(int argc, char **argv, options *o)
         const char *a = argv[i], *next = i + 1 < argc ? argv[i + 1] : NULL;
         if (!strcmp(a, "--quick"))
             o->quick = true;
-        else if (!strcmp(a, "--sf1"))
-            o->sf1 = true;
-        else if (!strcmp(a, "--exact"))
-            o->exact = true;
         else if (!next)
             fail("unknown option, or its value is missing; the first lines of bench_sdtree.c list them");
-        else if (!strcmp(a, "--seeds"))
-            o->seeds = atoi(argv[++i]);
-        else if (!strcmp(a, "--min-log2"))
-            o->min_log2 = atoi(argv[++i]);
-        else if (!strcmp(a, "--max-log2"))
-            o->max_log2 = atoi(argv[++i]);
         else if (!strcmp(a, "--set"))
             set_option(&o->desc, argv[++i]);
         else if (!strcmp(a, "--json")) {
@@ -789,27 +722,19 @@ static void parse(int argc, char **argv, options *o)
         } else
             fail("unknown option; the first lines of bench_sdtree.c list them");
     }
-    if (o->seeds < 1 || o->min_log2 < 4 || o->max_log2 > 28)
-        fail("--seeds from 1, --min-log2 from 4, --max-log2 to 28");
 }
 
 int main(int argc, char **argv)
 {
     options o;
     memset(&o, 0, sizeof o);
-    o.seeds = 1;
-    o.min_log2 = 14;
-    o.max_log2 = 24;
     o.desc.target = GSD_TARGET_RADIANCE;
     o.desc.bounds_max[0] = o.desc.bounds_max[1] = o.desc.bounds_max[2] = 1;
     parse(argc, argv, &o);
     o.repeats = o.quick ? 2 : 12;
     o.queries = o.quick ? 1 << 16 : 1 << 18;
     bench_print_machine(json_file);
-    if (o.sf1)
-        run_sf1(&o);
-    else
-        run_micro(&o);
+    run_micro(&o);
     if (json_file) {
         fprintf(json_file, "\n]}\n");
         fclose(json_file);

@@ -1,7 +1,8 @@
-/* sf1.h: SF1, a known radiance field in the unit cube, to score what a guiding method has learned without a renderer.
+/* sf1.h: known radiance fields in the unit cube, to score what a guiding method has learned without a renderer.
 
-   Points lie uniformly on the six walls of [0,1]^3 with the normal inward. Four ball-like sources, two of them hidden
-   from part of the cube, each seen as a von Mises-Fisher lobe that narrows with distance, over a constant 0.05.
+   Points lie uniformly on the six walls of [0,1]^3 with the normal inward. Ball-like sources, some of them hidden from
+   part of the cube, are each seen as a von Mises-Fisher lobe that narrows with distance, over a constant 0.05. SF1 is
+   the field of the four sources of sf1_default; field.h reads others from files.
 
      >>field    sources and radiance
      >>draw     training samples
@@ -13,7 +14,7 @@
 #include <stdint.h>
 
 #define SF1_PI 3.14159265358979323846
-#define SF1_SOURCES 4
+#define SF1_MAX_SOURCES 64
 #define SF1_UPDATES 8
 #define SF1_POINTS 512
 #define SF1_DIRECTIONS 4096
@@ -39,6 +40,22 @@ static inline double sf1_normal(sf1_rng *r)
     return sqrt(-2 * log(u)) * cos(2 * SF1_PI * v);
 }
 
+/* Seen from x iff visible . (x, 1) > 0. */
+typedef struct sf1_source {
+    double centre[3], radius, strength, visible[4];
+} sf1_source;
+
+typedef struct sf1_field {
+    sf1_source source[SF1_MAX_SOURCES];
+    int count;
+} sf1_field;
+
+static const sf1_field sf1_default = {{{{.5, .98, .5}, .20, 14.4, {0, 0, 0, 1}},
+                                       {{.15, .5, .85}, .08, 56.25, {0, 0, 1, -.3}},
+                                       {{.02, .3, .4}, .30, 3, {0, 0, 0, 1}},
+                                       {{.98, .7, .2}, .12, 44.4, {0, -.5, -1, .9}}},
+                                      4};
+
 typedef struct sf1_lobe {
     double mu[3], kappa, phi, distance;
 } sf1_lobe;
@@ -46,32 +63,31 @@ typedef struct sf1_lobe {
 /* A point's view of the field. */
 typedef struct sf1_point {
     double x[3], n[3];
-    sf1_lobe lobe[SF1_SOURCES];
-    double phi_sum;
+    sf1_lobe lobe[SF1_MAX_SOURCES];
+    int count;
+    double phi_sum; /* 0 where no source is visible */
 } sf1_point;
 
 static inline double sf1_dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
-static inline void sf1_make_point(sf1_rng *rng, sf1_point *p)
+static inline void sf1_make_point(const sf1_field *field, sf1_rng *rng, sf1_point *p)
 {
-    static const double source[SF1_SOURCES][5] = {
-        {.5, .98, .5, .20, 14.4}, {.15, .5, .85, .08, 56.25}, {.02, .3, .4, .30, 3}, {.98, .7, .2, .12, 44.4}};
     int k = (int)(6 * sf1_uniform(rng)), axis = k >> 1, side = k & 1;
     for (int i = 0; i < 3; ++i) {
         p->x[i] = i == axis ? side : sf1_uniform(rng);
         p->n[i] = i == axis ? 1 - 2 * side : 0;
     }
     p->phi_sum = 0;
-    for (int j = 0; j < SF1_SOURCES; ++j) {
-        const double *s = source[j];
+    p->count = field->count;
+    for (int j = 0; j < p->count; ++j) {
+        const sf1_source *s = &field->source[j];
         sf1_lobe *l = &p->lobe[j];
-        double v[3] = {s[0] - p->x[0], s[1] - p->x[1], s[2] - p->x[2]}, r2 = s[3] * s[3];
-        double d = sqrt(sf1_dot(v, v)) + 1e-12;
-        int visible = j == 1 ? p->x[2] > .3 : j == 3 ? p->x[2] + .5 * p->x[1] < .9 : 1;
+        double v[3] = {s->centre[0] - p->x[0], s->centre[1] - p->x[1], s->centre[2] - p->x[2]};
+        double r2 = s->radius * s->radius, d = sqrt(sf1_dot(v, v)) + 1e-12;
         for (int i = 0; i < 3; ++i)
             l->mu[i] = v[i] / d;
         l->kappa = fmin(fmax(2 * d * d / r2, 1), 4000);
-        l->phi = visible * s[4] * r2 / (d * d + r2);
+        l->phi = sf1_dot(s->visible, p->x) + s->visible[3] > 0 ? s->strength * r2 / (d * d + r2) : 0;
         l->distance = d;
         p->phi_sum += l->phi;
     }
@@ -93,7 +109,7 @@ static inline double sf1_radiance(const sf1_point *p, const double *w, double *d
     }
     if (distance)
         *distance = exit;
-    for (int j = 0; j < SF1_SOURCES; ++j) {
+    for (int j = 0; j < p->count; ++j) {
         double term = p->lobe[j].phi * sf1_lobe_pdf(&p->lobe[j], w);
         L += term;
         if (term > largest) {
@@ -128,21 +144,28 @@ static inline void sf1_around(const double *n, double z, double u, double *w)
         w[i] = c * s[i] + d * t[i] + z * n[i];
 }
 
+/* The visible lobes in proportion to their strength there; where none is visible, all directions alike. */
 static inline void sf1_sample_lobes(sf1_rng *rng, const sf1_point *p, double *w)
 {
     double u = sf1_uniform(rng) * p->phi_sum, e;
     int j = 0;
-    while (j < SF1_SOURCES - 1 && u >= p->lobe[j].phi)
+    while (j < p->count - 1 && u >= p->lobe[j].phi)
         u -= p->lobe[j++].phi;
     const sf1_lobe *l = &p->lobe[j];
     e = sf1_uniform(rng);
+    if (!(p->phi_sum > 0)) {
+        sf1_around(p->n, 2 * e - 1, sf1_uniform(rng), w);
+        return;
+    }
     sf1_around(l->mu, 1 + log(e + (1 - e) * exp(-2 * l->kappa)) / l->kappa, sf1_uniform(rng), w);
 }
 
 static inline double sf1_lobes_pdf(const sf1_point *p, const double *w)
 {
     double sum = 0;
-    for (int j = 0; j < SF1_SOURCES; ++j)
+    if (!(p->phi_sum > 0))
+        return 1 / (4 * SF1_PI);
+    for (int j = 0; j < p->count; ++j)
         sum += p->lobe[j].phi * sf1_lobe_pdf(&p->lobe[j], w);
     return sum / p->phi_sum;
 }
@@ -157,11 +180,11 @@ typedef struct sf1_sample {
 } sf1_sample;
 
 /* Draw one training sample of the given update; 0 where the direction was below the horizon and is dropped. */
-static inline int sf1_draw(sf1_rng *rng, int update, int exact_weights, sf1_sample *out)
+static inline int sf1_draw(const sf1_field *field, sf1_rng *rng, int update, int exact_weights, sf1_sample *out)
 {
     sf1_point p;
     double w[3], distance;
-    sf1_make_point(rng, &p);
+    sf1_make_point(field, rng, &p);
     if (update > 0 && sf1_uniform(rng) < 0.5)
         sf1_sample_lobes(rng, &p, w);
     else
@@ -196,14 +219,15 @@ typedef struct sf1_score {
     double c; /* h = L cos, p = half cosine, half guide */
 } sf1_score;
 
-static inline sf1_score sf1_evaluate(sf1_pdf_fn pdf, void *user, uint64_t seed, int points, int directions)
+static inline sf1_score sf1_evaluate(const sf1_field *field, sf1_pdf_fn pdf, void *user, uint64_t seed, int points,
+                                     int directions)
 {
     sf1_rng rng = {seed};
     sf1_score mean = {0, 0};
     for (int i = 0; i < points; ++i) {
         sf1_point p;
         double ha = 0, va = 0, hc = 0, vc = 0;
-        sf1_make_point(&rng, &p);
+        sf1_make_point(field, &rng, &p);
         for (int j = 0; j < directions; ++j) {
             double w[3];
             if (sf1_uniform(&rng) < 0.8)

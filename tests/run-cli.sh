@@ -1,10 +1,12 @@
 #!/usr/bin/env bash
-# The renderer's command line: what it refuses, what it says, what it writes. Speaks TAP.
-# Each case runs $BUILD/render on tiny scenes written here; exit 1 with a message is asked for, never a signal.
+# The programs' command lines: what they refuse, what they say, what they write. Speaks TAP.
+# Each case runs $BUILD/render on tiny scenes written here (imgerr and bench_field at the end); exit 1 with a message is asked for, never a signal.
 export LC_ALL=C
 cd "$(dirname "$0")/.." || exit 1
 render=$PWD/${BUILD:-build}/render
 imgerr=$PWD/${BUILD:-build}/imgerr
+field=$PWD/${BUILD:-build}/bench_field
+fields=$PWD/bench/fields
 tmp=$(mktemp -d) || exit 1
 trap 'rm -rf "$tmp"' EXIT
 cd "$tmp" || exit 1
@@ -197,6 +199,33 @@ report $? 'imgerr: a bad clamp is named'
 "$imgerr" >out 2>log
 [ $? -eq 1 ] && grep -qi usage log
 report $? 'imgerr: usage'
+
+# ---- bench_field
+# field_refuses NAME PATTERN ARGUMENTS...: as refuses, for bench_field.
+field_refuses() { render=$field refuses "$@"; }
+field_refuses 'bench_field: missing file is named' 'absent\.txt: .*--fields' --fields absent.txt
+printf '# one\ncentre .5 .5 .5 radius .1 strength 2\ncentre .5 .5 radius .1 strength 2\n' >bad.txt
+field_refuses 'bench_field: missing number: file, line and form' 'bad\.txt:3: "centre" wants 1 more.*a line is: centre' --fields bad.txt
+printf 'centre .5 .5 .5 radius 0 strength 2\n' >bad.txt
+field_refuses 'bench_field: radius out of range' 'bad\.txt:1: "radius" wants' --fields bad.txt
+printf 'centre .5 .5 .5 radius .1 strength nan\n' >bad.txt
+field_refuses 'bench_field: not a number' 'bad\.txt:1: "strength" wants.*"nan"' --fields bad.txt
+printf 'centre .5 .5 .5 radius .1 strength 2 visible 1 0 0 -.5 1\n' >bad.txt
+field_refuses 'bench_field: text after the last number' 'bad\.txt:1: nothing may follow' --fields bad.txt
+printf '# nothing\n' >bad.txt
+field_refuses 'bench_field: no source' 'bad\.txt:1: no source' --fields bad.txt
+field_refuses 'bench_field: unknown method is named' 'nosuch.*--help' --methods nosuch
+field_refuses 'bench_field: bad number of samples' '--samples wants.*"ten"' --samples ten
+field_refuses 'bench_field: --fields without a file' '--fields wants' --fields --exact
+field_refuses 'bench_field: unwritable JSON is named' 'absent/x\.json' --json absent/x.json
+# A and C of each row.
+scores() { sed -n 's/.*"a": \([^,]*\), "c": \([^,]*\),.*/\1 \2/p' "$1"; }
+"$field" --methods sdtree --seeds 1 --samples 10 --fields sf1 "$fields/sf1.txt" "$fields/small.txt" --json field.json >out 2>log
+status=$?
+scores field.json >log
+[ $status -eq 0 ] && [ "$(wc -l <log)" -eq 3 ] && [ "$(sed -n 1p log)" = "$(sed -n 2p log)" ] &&
+    [ "$(sed -n 1p log)" != "$(sed -n 3p log)" ]
+report $? 'bench_field: sf1.txt is the field that is built in, small.txt another'
 
 echo "1..$count"
 [ "$bad" -eq 0 ]
