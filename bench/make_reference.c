@@ -846,8 +846,10 @@ static int refuse(const options *o, const state *s, const verdict *c)
         o->method, o->check, c->failed, c->tested, c->left_out, c->worst, c->limit);
     print_worst(c);
     if (write_heat(s, c, path))
-        fprintf(stderr, "  %s shows where (red); one of the methods is wrong there. The rounds are kept in %s\n", path,
-                s->path);
+        fprintf(stderr,
+                "  %s shows where (red); one of the methods is wrong there. The rounds are kept in %s:\n  where chance "
+                "is suspected, more --rounds settle it\n",
+                path, s->path);
     return PROGRAM_FAILED;
 }
 
@@ -864,7 +866,7 @@ static int write_reference(const options *o, const state *s, const quality *q, c
     append(&command, " --round-spp %d --check-spp %d --rounds %d", s->h.spp[MAIN], s->h.spp[CHECK], total_rounds(s));
     append(&command, " --measured %.4g --ratio %g -o %s", q->measured, o->ratio, slash ? slash + 1 : o->out);
     snprintf(relmse, sizeof relmse, "%.4g (untrimmed %.4g)", q->own.relmse, q->own.relmse_untrimmed);
-    snprintf(samples, sizeof samples, "%lld = %d rounds of %d, bad samples %llu",
+    snprintf(samples, sizeof samples, "%lld spp = %d rounds of %d, %llu bad samples",
              (long long)s->h.spp[MAIN] * s->h.rounds[MAIN], s->h.rounds[MAIN], s->h.spp[MAIN],
              (unsigned long long)s->h.bad);
     snprintf(goal, sizeof goal, "1/%g of %.4g: %s", o->ratio, q->measured, q->reached ? "reached" : "not reached");
@@ -884,7 +886,7 @@ static int write_reference(const options *o, const state *s, const quality *q, c
     if (!ok)
         return die("%s: cannot write the picture: %s", o->out, err);
     struct stat file;
-    printf("%s: %.0f kB, %s spp\n  own relMSE %s, wanted %s\n  check: %s\n  %.0f CPU s (%s %.0f, %s %.0f)\n", o->out,
+    printf("%s: %.0f kB, %s\n  own relMSE %s, wanted %s\n  check: %s\n  %.0f CPU s (%s %.0f, %s %.0f)\n", o->out,
            stat(o->out, &file) == 0 ? (double)file.st_size / 1000 : 0, samples, relmse, goal, check,
            s->h.cpu[MAIN] + s->h.cpu[CHECK] + s->h.other_cpu, o->method, s->h.cpu[MAIN], o->check, s->h.cpu[CHECK]);
     return 0;
@@ -1068,7 +1070,7 @@ int main(int argc, char **argv)
             fputs(usage_text, stdout);
             return 0;
         }
-    if (parse(&o, argc, argv) || hash_settings(&o, &key))
+    if (parse(&o, argc, argv) || hash_settings(&o, &key) || (o.out && check_output(&o)))
         return PROGRAM_FAILED;
     session w = {.o = &o};
     int rc = state_open(&w.s, &o, key);
@@ -1076,7 +1078,6 @@ int main(int argc, char **argv)
         snprintf(cache_path, sizeof cache_path, "%s/%016llx.exr", o.state_dir, (unsigned long long)key);
         o.out = cache_path;
     }
-    rc = rc ? rc : check_output(&o);
     w.pixels = rc ? NULL : malloc(run_bytes(&w.s));
     if (!rc && !w.pixels)
         rc = die("out of memory for a round; choose a smaller --size");
