@@ -64,6 +64,9 @@ EXAMPLES := $(patsubst examples/%.c,$(B)/examples/%,$(wildcard examples/*.c))
 TESTS_ALL := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/test_*.c))
 MICRO := $(B)/bench_sdtree
 BENCHES := $(patsubst bench/%.c,$(B)/%,$(wildcard bench/bench_*.c))
+# Programs of bench/ that are not timings: `make bench` does not run them.
+BENCH_MAINS := make_reference
+BENCH_TOOLS := $(patsubst bench/%.c,$(B)/%,$(wildcard $(BENCH_MAINS:%=bench/%.c)))
 # TESTS="a b" picks test_a and test_b, and "matrix", "rig", "cli"; empty = all.
 TEST_PROGRAMS := $(if $(TESTS),$(filter $(TESTS:%=$(B)/tests/test_%),$(TESTS_ALL)),$(TESTS_ALL))
 SOURCES := $(sort $(HEADERS) $(wildcard examples/*.c examples/tracer/*.[ch] tests/*.[ch] tests/*/*.[ch] bench/*.[ch]))
@@ -80,7 +83,7 @@ SUB = +@$(MAKE) --no-print-directory $(JOBS)
 all: check-deps
 	$(SUB) programs
 
-programs: $(PROGRAMS) $(EXAMPLES) $(TESTS_ALL) $(BENCHES)
+programs: $(PROGRAMS) $(EXAMPLES) $(TESTS_ALL) $(BENCHES) $(BENCH_TOOLS)
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
@@ -126,7 +129,7 @@ $(TESTS_ALL): $(B)/tests/%: $(B)/obj/tests/%.o $(B)/libtracer.a
 	$(SAY) LD $@
 	$(LINK) -lcmocka $(LIBS) -o $@
 
-$(BENCHES): $(B)/%: $(B)/obj/bench/%.o $(B)/libtracer.a
+$(BENCHES) $(BENCH_TOOLS): $(B)/%: $(B)/obj/bench/%.o $(B)/libtracer.a
 	$(SAY) LD $@
 	$(LINK) $(LIBS) -o $@
 
@@ -199,7 +202,7 @@ check-deps:
 test: deps
 	$(SUB) run-test
 
-run-test: $(TEST_PROGRAMS) $(PROGRAMS) $(EXAMPLES) $(B)/bench_field $(if $(filter release,$(config)),$(B)/bench_error)
+run-test: $(TEST_PROGRAMS) $(PROGRAMS) $(EXAMPLES) $(BENCH_TOOLS) $(B)/bench_field $(if $(filter release,$(config)),$(B)/bench_error)
 	@BUILD=$(B) CONFIG=$(config) CC='$(CC)' TESTS='$(TESTS)' bash tests/run.sh $(TEST_PROGRAMS)
 	$(if $(filter coverage,$(config)),@$(MAKE) --no-print-directory coverage-report)
 

@@ -538,7 +538,7 @@ int main(int argc, char **argv)
     parse(argc, argv, &o);
     if (o.json && !(json_file = fopen(o.json, "w")))
         fail("%s: cannot be written: %s", o.json, strerror(errno));
-    bench_print_machine();
+    bench_print_machine(NULL);
     if (o.growth)
         ok = run_growth(&o);
     else

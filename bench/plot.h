@@ -216,7 +216,7 @@ static inline bool plot_write(const char *path, const char *title, const char *x
         return false;
     plot_axis ax = plot_make_axis(series, count, true, log_x, log_y);
     plot_axis ay = plot_make_axis(series, count, false, log_x, log_y);
-    int rows = 20 * count + PLOT_TOP + 20, tall = rows > PLOT_HEIGHT ? rows : PLOT_HEIGHT; /* of a long legend */
+    int legend = 20 * count + PLOT_TOP + 20, tall = legend > PLOT_HEIGHT ? legend : PLOT_HEIGHT; /* of a long legend */
     fprintf(f,
             "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"%d\" height=\"%d\" viewBox=\"0 0 %d %d\" "
             "font-family=\"Helvetica,Arial,sans-serif\" font-size=\"12\" fill=\"#222222\" stroke=\"none\">\n"

@@ -1,12 +1,14 @@
 #!/usr/bin/env bash
 # The programs' command lines: what they refuse, what they say, what they write. Speaks TAP.
-# Each case runs $BUILD/render on tiny scenes written here (imgerr and bench_field at the end); exit 1 with a message is asked for, never a signal.
+# Each case runs $program of $BUILD, the renderer at first, on tiny scenes written here; exit 1 with a message is asked for, never a signal.
 export LC_ALL=C
 cd "$(dirname "$0")/.." || exit 1
 render=$PWD/${BUILD:-build}/render
 imgerr=$PWD/${BUILD:-build}/imgerr
 field=$PWD/${BUILD:-build}/bench_field
 fields=$PWD/bench/fields
+make_reference=$PWD/${BUILD:-build}/make_reference
+program=$render
 tmp=$(mktemp -d) || exit 1
 trap 'rm -rf "$tmp"' EXIT
 cd "$tmp" || exit 1
@@ -28,7 +30,7 @@ report() { # report STATUS NAME: 0 = ok; shows the last command's output where i
 refuses() {
     local name=$1 pattern=$2 status
     shift 2
-    "$render" "$@" >out 2>log
+    "$program" "$@" >out 2>log
     status=$?
     if [ $status -ne 1 ]; then
         why="exit status $status, wanted 1" && report 1 "$name"
@@ -42,7 +44,7 @@ refuses() {
 completes() {
     local name=$1 status
     shift
-    "$render" "$@" >out 2>log
+    "$program" "$@" >out 2>log
     status=$? why="exit status $status, wanted 0"
     [ $status -eq 0 ]
     report $? "$name"
@@ -202,7 +204,7 @@ report $? 'imgerr: usage'
 
 # ---- bench_field
 # field_refuses NAME PATTERN ARGUMENTS...: as refuses, for bench_field.
-field_refuses() { render=$field refuses "$@"; }
+field_refuses() { program=$field refuses "$@"; }
 field_refuses 'bench_field: missing file is named' 'absent\.txt: .*--fields' --fields absent.txt
 printf '# one\ncentre .5 .5 .5 radius .1 strength 2\ncentre .5 .5 radius .1 strength 2\n' >bad.txt
 field_refuses 'bench_field: missing number: file, line and form' 'bad\.txt:3: "centre" wants 1 more.*a line is: centre' --fields bad.txt
@@ -226,6 +228,57 @@ scores field.json >log
 [ $status -eq 0 ] && [ "$(wc -l <log)" -eq 3 ] && [ "$(sed -n 1p log)" = "$(sed -n 2p log)" ] &&
     [ "$(sed -n 1p log)" != "$(sed -n 3p log)" ]
 report $? 'bench_field: sf1.txt is the field that is built in, small.txt another'
+# ---- make_reference: 12 rounds of the method and 4 of the check are the least that can be checked
+program=$make_reference
+mkdir whole parts killed biased same
+refuses 'make_reference: no output' '-o|--cache' good.xml
+refuses 'make_reference: a method cannot check itself' 'check.*pt' good.xml -o r.exr --method pt
+refuses 'make_reference: unknown check' 'nosuch' good.xml -o r.exr --check nosuch
+refuses 'make_reference: bad ratio' 'ratio.*-2' good.xml -o r.exr --ratio -2
+refuses 'make_reference: bad size' 'size' good.xml -o r.exr --size 64
+refuses 'make_reference: missing scene' 'absent\.xml' absent.xml -o r.exr
+refuses 'make_reference: unwritable output, before any round' 'absent/r\.exr' good.xml -o absent/r.exr --state parts
+refuses 'make_reference: broken scene' 'broken\.xml:3' broken.xml -o r.exr --state parts --round-spp 1
+make="good.xml --size 64x36 --round-spp 8 --check-spp 8 --quiet --measured 0.5"
+completes 'make_reference: as good as asked for' $make --state whole -o whole/r.exr --rounds 16 --ratio 2
+grep -aq 'make_reference good.xml --size 64x36.*--rounds 16.*-o r.exr' whole/r.exr && grep -aq '96 spp = 12 rounds of 8' whole/r.exr
+report $? 'make_reference: the header tells the command and the samples'
+"$imgerr" whole/r.exr whole/r.exr >out 2>log
+report $? 'make_reference: the picture can be read'
+"$program" $make --state parts -o parts/r.exr --rounds 5 --ratio 2 --threads 1 >out 2>log
+[ $? -eq 2 ] && grep -q 'not checked' log
+report $? 'make_reference: too few rounds are told by exit status 2'
+completes 'make_reference: goes on' $make --state parts -o parts/r.exr --rounds 16 --ratio 2 --threads 2
+cmp whole/r.exr parts/r.exr >log 2>&1
+report $? 'make_reference: interrupted, the same picture'
+"$program" $make --state killed -o killed/r.exr --rounds 16 --ratio 2 >out 2>log &
+sleep 0.1
+kill -9 $! 2>/dev/null
+wait $! 2>/dev/null
+completes 'make_reference: goes on after being killed' $make --state killed -o killed/r.exr --rounds 16 --ratio 2
+cmp whole/r.exr killed/r.exr >log 2>&1
+report $? 'make_reference: killed, the same picture'
+"$program" $make --state whole -o whole/far.exr --rounds 16 --ratio 1e6 >out 2>log
+[ $? -eq 2 ] && grep -q 'not good enough' log && grep -aq 'not reached' whole/far.exr
+report $? 'make_reference: a reference that is not good enough says so'
+sed 's/4,4,4/4,4,4.2/' good.xml >brighter.xml
+refuses 'make_reference: a check with more blue light refuses' 'not written.*differ' $make --state biased -o biased/r.exr \
+    --check-scene brighter.xml --rounds 16 --ratio 2
+[ -s biased/r-check.png ] && [ ! -e biased/r.exr ] && grep -q 'tile at pixel' log
+report $? 'make_reference: where they differ is shown, and no picture written'
+completes 'make_reference: the same scene in another file agrees' $make --state same -o same/r.exr --ratio 2 \
+    --check-scene ./good.xml --rounds 16
+refuses 'make_reference: other samples per round than the state' 'state: has rounds of 8.*--round-spp' \
+    good.xml --size 64x36 --round-spp 9 --state whole -o whole/r.exr
+cp whole/*.state whole.bin
+cp same/*.state "$(echo whole/*.state)"
+refuses 'make_reference: a state of other settings' 'state: belongs to another' $make --state whole -o whole/r.exr
+head -c 5000 whole.bin >"$(echo whole/*.state)"
+refuses 'make_reference: a damaged state' 'state: damaged' $make --state whole -o whole/r.exr
+completes 'make_reference: --cache' $make --state parts --cache --rounds 16 --ratio 2
+[ -s "$(echo parts/????????????????.exr)" ]
+report $? 'make_reference: --cache names the picture by its settings'
+program=$render
 
 echo "1..$count"
 [ "$bad" -eq 0 ]

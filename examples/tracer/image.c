@@ -570,7 +570,8 @@ static exr_result_t write_chunks(exr_context_t context, const exr_source *source
     return rv;
 }
 
-static exr_result_t encode_exr(blob *b, const char *path, const exr_source *sources, int count)
+static exr_result_t encode_exr(blob *b, const char *path, const exr_source *sources, int count,
+                               const tr_attribute *attributes, int attribute_count)
 {
     exr_context_t context = NULL;
     exr_context_initializer_t init = EXR_DEFAULT_CONTEXT_INITIALIZER;
@@ -588,6 +589,8 @@ static exr_result_t encode_exr(blob *b, const char *path, const exr_source *sour
     for (int i = 0; rv == EXR_ERR_SUCCESS && i < count; ++i)
         rv = exr_add_channel(context, part, sources[i].name, sources[i].full_float ? EXR_PIXEL_FLOAT : EXR_PIXEL_HALF,
                              EXR_PERCEPTUALLY_LOGARITHMIC, 1, 1);
+    for (int i = 0; rv == EXR_ERR_SUCCESS && i < attribute_count; ++i)
+        rv = exr_attr_set_string(context, part, attributes[i].name, attributes[i].value);
     if (rv == EXR_ERR_SUCCESS)
         rv = exr_write_header(context);
     if (rv == EXR_ERR_SUCCESS)
@@ -601,7 +604,8 @@ static exr_result_t encode_exr(blob *b, const char *path, const exr_source *sour
     return rv == EXR_ERR_SUCCESS ? end : rv;
 }
 
-bool tr_exr_write(const char *path, const tr_layer *layers, int layer_count, char *err, size_t err_size)
+bool tr_exr_write_attributes(const char *path, const tr_layer *layers, int layer_count, const tr_attribute *attributes,
+                             int attribute_count, char *err, size_t err_size)
 {
     exr_source sources[EXR_MAX_CHANNELS];
     if (layer_count < 1 || !layers[0].image)
@@ -610,11 +614,16 @@ bool tr_exr_write(const char *path, const tr_layer *layers, int layer_count, cha
     if (!count)
         return false;
     blob b = {0};
-    exr_result_t rv = encode_exr(&b, path, sources, count);
+    exr_result_t rv = encode_exr(&b, path, sources, count, attributes, attribute_count);
     bool ok = rv == EXR_ERR_SUCCESS ? blob_write_file(&b, path, err, err_size)
                                     : exr_fail(path, "cannot build the EXR", rv, err, err_size);
     free(b.data);
     return ok;
+}
+
+bool tr_exr_write(const char *path, const tr_layer *layers, int layer_count, char *err, size_t err_size)
+{
+    return tr_exr_write_attributes(path, layers, layer_count, NULL, 0, err, err_size);
 }
 
 /* ---- >>write-png -------------------------------------------------------------------------------------------- */

@@ -69,6 +69,12 @@ bool tr_image_read(const char *path, bool raw, tr_image *image, char *err, size_
 bool tr_exr_read_layer(const char *path, const char *layer, tr_image *image, char *err, size_t err_size);
 /* Half-float (or float) scanline EXR, ZIP compression, all layers of one size. */
 bool tr_exr_write(const char *path, const tr_layer *layers, int layer_count, char *err, size_t err_size);
+/* One string for an EXR's header; names of at most 31 characters that no standard attribute has. */
+typedef struct tr_attribute {
+    const char *name, *value;
+} tr_attribute;
+bool tr_exr_write_attributes(const char *path, const tr_layer *layers, int layer_count, const tr_attribute *attributes,
+                             int attribute_count, char *err, size_t err_size);
 /* Tone-mapped PNG: exposure, then sRGB curve, clipped. exposure <= 0 picks one from the image's mean luminance. */
 bool tr_png_write(const char *path, const tr_image *image, float exposure, char *err, size_t err_size);
 float tr_auto_exposure(const tr_image *image);
