@@ -350,7 +350,7 @@ static void plot_all(const options *o, const growth *g)
     int n = o->method_count;
     for (int i = 0; i < n; ++i) {
         const char *name = o->methods[i]->name;
-        snprintf(fit[i], sizeof fit[i], "%s: a + b log n", name);
+        snprintf(fit[i], sizeof fit[i], "%s: fit", name);
         plot_series series[6] = {{name, g[i].samples, g[i].record, g[i].count, false},
                                  {fit[i], g[i].samples, g[i].record_line, g[i].count, true},
                                  {name, g[i].samples, g[i].query, g[i].count, false},
@@ -364,8 +364,10 @@ static void plot_all(const options *o, const growth *g)
         bytes[i] = series[4];
         extent[i] = series[5];
     }
-    plot_growth(o, "growth-sample.svg", "Time to learn from a sample", "samples", "ns", record, 2 * n, false);
-    plot_growth(o, "growth-query.svg", "Find, sample and density", "samples", "ns", query, 2 * n, false);
+    plot_growth(o, "growth-sample.svg", "Time to learn from a sample (fit: a + b log n)", "samples", "ns", record,
+                2 * n, false);
+    plot_growth(o, "growth-query.svg", "Find, sample and density (fit: a + b log n)", "samples", "ns", query, 2 * n,
+                false);
     plot_growth(o, "growth-bytes.svg", "Memory", "samples", "bytes", bytes, n, true);
     plot_growth(o, "growth-extent.svg", "Score and scene's extent", "extent", "A (1 is perfect)", extent, n, true);
 }
