@@ -3,6 +3,7 @@
 #   make demo        install what is missing, build, render the ajar scene with and without guiding, compare
 #   make test        install what is missing, build, run every test
 #   make             build only           make bench       run the microbenchmarks
+#   make stress      hostile and extreme input for every header, STRESS_SECONDS=30 STRESS_SEED=1 STRESS_ONLY=group
 #   make format      clang-format in place  make lint        only check
 #
 #   config=release|debug|scalar|sanitize|tsan|coverage    each has its own folder (build/, build-debug/, ...)
@@ -12,6 +13,8 @@
 config ?= release
 DEMO_SECONDS ?= 40
 DEMO_SIZE ?= 320x180
+STRESS_SECONDS ?= 30
+STRESS_SEED ?= 1
 
 ifeq ($(origin CC),default)
 CC := $(firstword $(foreach c,gcc clang,$(if $(shell command -v $(c) 2>/dev/null),$(c))) cc)
@@ -61,12 +64,13 @@ PROGRAMS := $(patsubst examples/tracer/%.c,$(B)/%,$(wildcard $(TRACER_MAINS:%=ex
 EXAMPLES := $(patsubst examples/%.c,$(B)/examples/%,$(wildcard examples/*.c))
 TESTS_ALL := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/test_*.c))
 BENCHES := $(patsubst bench/%.c,$(B)/%,$(wildcard bench/bench_*.c))
+STRESSES := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/stress_*.c))
 # TESTS="a b" picks test_a and test_b, and "matrix", "cli"; empty = all.
 TEST_PROGRAMS := $(if $(TESTS),$(filter $(TESTS:%=$(B)/tests/test_%),$(TESTS_ALL)),$(TESTS_ALL))
 SOURCES := $(sort $(HEADERS) $(wildcard examples/*.c examples/tracer/*.[ch] tests/*.[ch] tests/*/*.[ch] bench/*.[ch]))
 SCRIPTS := .ci/run $(wildcard tests/*.sh examples/*.sh)
 
-.PHONY: all programs deps check-deps demo test run-demo run-test expected-count bench run-bench format lint clean help
+.PHONY: all programs deps check-deps demo test stress run-demo run-test run-stress expected-count bench run-bench format lint clean help
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -77,7 +81,7 @@ SUB = +@$(MAKE) --no-print-directory $(JOBS)
 all: check-deps
 	$(SUB) programs
 
-programs: $(PROGRAMS) $(EXAMPLES) $(TESTS_ALL) $(BENCHES)
+programs: $(PROGRAMS) $(EXAMPLES) $(TESTS_ALL) $(STRESSES) $(BENCHES)
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
@@ -122,6 +126,10 @@ $(EXAMPLES): $(B)/examples/%: $(B)/obj/examples/%.o
 $(TESTS_ALL): $(B)/tests/%: $(B)/obj/tests/%.o $(B)/libtracer.a
 	$(SAY) LD $@
 	$(LINK) -lcmocka $(LIBS) -o $@
+
+$(STRESSES): $(B)/tests/%: $(B)/obj/tests/%.o
+	$(SAY) LD $@
+	$(LINK) -lm -lpthread -o $@
 
 $(BENCHES): $(B)/%: $(B)/obj/bench/%.o $(B)/libtracer.a
 	$(SAY) LD $@
@@ -199,6 +207,14 @@ test: deps
 run-test: $(TEST_PROGRAMS) $(PROGRAMS) $(EXAMPLES)
 	@BUILD=$(B) CONFIG=$(config) CC='$(CC)' TESTS='$(TESTS)' bash tests/run.sh $(TEST_PROGRAMS)
 	$(if $(filter coverage,$(config)),@$(MAKE) --no-print-directory coverage-report)
+
+# The headers alone: needs no library.
+stress:
+	$(SUB) run-stress
+
+run-stress: $(STRESSES)
+	@CONFIG=$(config) SECONDS_ALL='$(STRESS_SECONDS)' SEED='$(STRESS_SEED)' ONLY='$(STRESS_ONLY)' \
+		bash tests/stress.sh $(STRESSES)
 
 # Write down how many tests there are now: `make test` fails when fewer run.
 expected-count: deps
