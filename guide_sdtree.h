@@ -2614,7 +2614,7 @@ static void gsdi_judge_cells(gsdi_refinement *r, const gsd_pass *pass, double sa
     for (i = 0; i < r->field->block->cells; ++i) {
         gsdi_state *s = &r->field->states[i];
         if (s->fresh >= GSDI_REFLECTED_SAMPLES)
-            s->reflected = (float)(s->flow / s->fresh);
+            s->reflected = (float)fmin(s->flow / s->fresh, 1e30); /* a loaded sum may be larger */
         if (s->fresh > 0)
             gsdi_judge(r->desc, pixels, changed, r->fade, s, &r->stats);
         closed += s->gate == GSD_GATE_CLOSED ? s->fresh : 0;
@@ -4015,7 +4015,8 @@ GSD_API gsd_result gsd_validate(const gsd_field *field)
     float bins[3 * GSDI_BINS];
     uint32_t i;
     for (i = 0; i < b->roots; ++i)
-        if (i < 4 && (view.nodes[i].leaf.child || memcmp(&view.nodes[i].leaf.pdf, &view.nodes[0].leaf.pdf, 4) ||
+        if (i < 4 && (view.nodes[i].leaf.child || view.nodes[i].leaf.x || view.nodes[i].leaf.y ||
+                      memcmp(&view.nodes[i].leaf.pdf, &view.nodes[0].leaf.pdf, 4) ||
                       !(fabsf(view.nodes[i].leaf.pdf - GSD_INV_4PI) < 1e-7f)))
             return GSD_CORRUPT;
     if (field->target < GSD_TARGET_RADIANCE || field->target > GSD_TARGET_VARIANCE ||

@@ -2908,6 +2908,45 @@ static void test_forged_shares_of_the_gate_are_refused(void **state)
     free(data);
 }
 
+/* The uniform leaf lies at 0, 0, depth 0: a query shifts by its depth. */
+static void test_a_forged_uniform_leaf_is_refused(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    gsd_field *f;
+    OK(gsd_create(&d, &f));
+    for (uint32_t i = 0; i < 4; ++i) {
+        gsd_node *n = &gsdi_nodes(f->block)[i];
+        n->leaf.x = 200u << 24;
+        assert_int_equal(gsd_validate(f), GSD_CORRUPT);
+        n->leaf.x = 0;
+        n->leaf.y = 1;
+        assert_int_equal(gsd_validate(f), GSD_CORRUPT);
+        n->leaf.y = 0;
+        OK(gsd_validate(f));
+    }
+    gsd_destroy(f);
+}
+
+/* A save may claim that a cell reflects 1e49 a sample: it is whole, and still is after refine. */
+static void test_a_huge_flow_leaves_the_field_valid(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    gsd_field *f;
+    static gsd_training_sample s[100];
+    seed(3);
+    OK(gsd_create(&d, &f));
+    f->states[0].flow = 1e49;
+    OK(gsd_validate(f));
+    gsd_view v = gsd_get_view(f);
+    make_samples(&v, s, 100);
+    learn(f, s, 100);
+    OK(gsd_refine(f, NULL, NULL, NULL));
+    OK(gsd_validate(f));
+    gsd_destroy(f);
+}
+
 static void test_merge_equals_training_together(void **state)
 {
     (void)state;
@@ -3048,6 +3087,8 @@ int main(void)
         cmocka_unit_test(test_truncated_and_flipped_saves_are_refused),
         cmocka_unit_test(test_forged_saves_never_harm),
         cmocka_unit_test(test_forged_shares_of_the_gate_are_refused),
+        cmocka_unit_test(test_a_forged_uniform_leaf_is_refused),
+        cmocka_unit_test(test_a_huge_flow_leaves_the_field_valid),
         cmocka_unit_test(test_merge_equals_training_together),
         cmocka_unit_test(test_validate_notices_damage),
     };
