@@ -5,6 +5,7 @@
 #   make             build only           make bench       run the microbenchmarks
 #   make bench-readme                     put the last bench's figures into the README
 #   make bench-error [PRESET=quick|full]  error against run time: tables and plots in out/bench-error-PRESET
+#   make stress      hostile and extreme input for every header, STRESS_SECONDS=30 STRESS_SEED=1 STRESS_ONLY=group
 #   make format      clang-format in place  make lint        only check
 #
 #   config=release|debug|scalar|sanitize|tsan|coverage    each has its own folder (build/, build-debug/, ...)
@@ -14,6 +15,8 @@
 config ?= release
 DEMO_SECONDS ?= 40
 DEMO_SIZE ?= 320x180
+STRESS_SECONDS ?= 30
+STRESS_SEED ?= 1
 
 ifeq ($(origin CC),default)
 CC := $(firstword $(foreach c,gcc clang,$(if $(shell command -v $(c) 2>/dev/null),$(c))) cc)
@@ -64,6 +67,7 @@ EXAMPLES := $(patsubst examples/%.c,$(B)/examples/%,$(wildcard examples/*.c))
 TESTS_ALL := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/test_*.c))
 MICRO := $(B)/bench_sdtree
 BENCHES := $(patsubst bench/%.c,$(B)/%,$(wildcard bench/bench_*.c))
+STRESSES := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/stress_*.c))
 # Programs of bench/ that are not timings: `make bench` does not run them.
 BENCH_MAINS := make_reference
 BENCH_TOOLS := $(patsubst bench/%.c,$(B)/%,$(wildcard $(BENCH_MAINS:%=bench/%.c)))
@@ -72,7 +76,7 @@ TEST_PROGRAMS := $(if $(TESTS),$(filter $(TESTS:%=$(B)/tests/test_%),$(TESTS_ALL
 SOURCES := $(sort $(HEADERS) $(wildcard examples/*.c examples/tracer/*.[ch] tests/*.[ch] tests/*/*.[ch] bench/*.[ch]))
 SCRIPTS := .ci/run $(wildcard tests/*.sh examples/*.sh bench/*.sh)
 
-.PHONY: all programs deps check-deps demo test run-demo run-test expected-count bench run-bench bench-readme bench-error run-bench-error format lint clean help
+.PHONY: all programs deps check-deps demo test stress run-demo run-test run-stress expected-count bench run-bench bench-readme bench-error run-bench-error format lint clean help
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -83,7 +87,7 @@ SUB = +@$(MAKE) --no-print-directory $(JOBS)
 all: check-deps
 	$(SUB) programs
 
-programs: $(PROGRAMS) $(EXAMPLES) $(TESTS_ALL) $(BENCHES) $(BENCH_TOOLS)
+programs: $(PROGRAMS) $(EXAMPLES) $(TESTS_ALL) $(STRESSES) $(BENCHES) $(BENCH_TOOLS)
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
@@ -128,6 +132,10 @@ $(EXAMPLES): $(B)/examples/%: $(B)/obj/examples/%.o
 $(TESTS_ALL): $(B)/tests/%: $(B)/obj/tests/%.o $(B)/libtracer.a
 	$(SAY) LD $@
 	$(LINK) -lcmocka $(LIBS) -o $@
+
+$(STRESSES): $(B)/tests/%: $(B)/obj/tests/%.o
+	$(SAY) LD $@
+	$(LINK) -lm -lpthread -o $@
 
 $(BENCHES) $(BENCH_TOOLS): $(B)/%: $(B)/obj/bench/%.o $(B)/libtracer.a
 	$(SAY) LD $@
@@ -205,6 +213,14 @@ test: deps
 run-test: $(TEST_PROGRAMS) $(PROGRAMS) $(EXAMPLES) $(BENCH_TOOLS) $(B)/bench_field $(if $(filter release,$(config)),$(B)/bench_error)
 	@BUILD=$(B) CONFIG=$(config) CC='$(CC)' TESTS='$(TESTS)' bash tests/run.sh $(TEST_PROGRAMS)
 	$(if $(filter coverage,$(config)),@$(MAKE) --no-print-directory coverage-report)
+
+# The headers alone: needs no library.
+stress:
+	$(SUB) run-stress
+
+run-stress: $(STRESSES)
+	@CONFIG=$(config) SECONDS_ALL='$(STRESS_SECONDS)' SEED='$(STRESS_SEED)' ONLY='$(STRESS_ONLY)' \
+		bash tests/stress.sh $(STRESSES)
 
 # Write down how many tests there are now: `make test` fails when fewer run.
 expected-count: deps

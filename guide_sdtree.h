@@ -599,15 +599,15 @@ GSD_QUERY float gsd_bin_cosine(const gsd_view *view, const float normal[3], uint
 }
 
 /* Multiply a handle's density by the cosine to a normal (unit, on the side that light comes from): gsd_find does it
-   itself, this is for gsd_find_cell. A zero normal, an untrained cell and one that does not guide (alpha = 1) are left
-   alone. [any thread] */
+   itself, this is for gsd_find_cell. With a normal that is far from unit (zero, NaN), an untrained cell and one that
+   does not guide (alpha = 1) it is left alone. [any thread] */
 GSD_QUERY void gsd_orient(const gsd_view *view, gsd_handle *handle, const float normal[3])
 {
     const float *mass = view->masses + handle->jump;
     float z[8] = {0, 0, 0, 0, 0, 0, 0, 0};
+    float l = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2];
     uint32_t k, i;
-    if (handle->jump == 0 || handle->alpha >= 1 ||
-        !(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2] > 0.5f))
+    if (handle->jump == 0 || handle->alpha >= 1 || !(l > 0.5f && l < 2))
         return;
     for (k = 0; k < 64; k += 8)
         for (i = 0; i < 8; ++i)
@@ -2039,8 +2039,8 @@ static void gsdi_tree_aliases(gsdi_block *b, const gsdi_tree *tree)
 {
     const gsd_node *nodes = gsdi_nodes(b);
     gsd_alias *slots = (gsd_alias *)(void *)((char *)b + b->aliases_at) + tree->alias;
-    double e = (double)b->uniform;
-    uint32_t n = 0, i, small = GSDI_NONE, large = GSDI_NONE;
+    double e = (double)b->uniform, rest = 0; /* of the large leaf at hand: small ones take from it often */
+    uint32_t n = 0, i, small = GSDI_NONE, large = GSDI_NONE, current = GSDI_NONE;
     for (i = tree->first; i < tree->first + tree->groups * 4; ++i) {
         const gsd_node *node = &nodes[i];
         double area = 12.566370614359172 / pow(4, (double)(node->leaf.x >> 24)), mass;
@@ -2061,8 +2061,13 @@ static void gsdi_tree_aliases(gsdi_block *b, const gsdi_tree *tree)
         uint32_t s = small, l = large;
         small = slots[s].other;
         slots[s].other = slots[l].node;
-        slots[l].threshold -= 1 - slots[s].threshold;
-        if (slots[l].threshold < 1) {
+        if (l != current) {
+            current = l;
+            rest = (double)slots[l].threshold;
+        }
+        rest -= 1 - (double)slots[s].threshold;
+        if (rest < 1) {
+            slots[l].threshold = (float)rest;
             large = slots[l].other;
             slots[l].other = small;
             small = l;
@@ -2609,7 +2614,7 @@ static void gsdi_judge_cells(gsdi_refinement *r, const gsd_pass *pass, double sa
     for (i = 0; i < r->field->block->cells; ++i) {
         gsdi_state *s = &r->field->states[i];
         if (s->fresh >= GSDI_REFLECTED_SAMPLES)
-            s->reflected = (float)(s->flow / s->fresh);
+            s->reflected = (float)fmin(s->flow / s->fresh, 1e30); /* a loaded sum may be larger */
         if (s->fresh > 0)
             gsdi_judge(r->desc, pixels, changed, r->fade, s, &r->stats);
         closed += s->gate == GSD_GATE_CLOSED ? s->fresh : 0;
@@ -3076,9 +3081,9 @@ GSDI_AVX2 static __m256 gsdi_bin_row_avx2(const gsd_view *view, const __m256 nor
 GSDI_AVX2 static void gsdi_orient_avx2(const gsd_view *view, gsd_handle *handle, const float *n)
 {
     __m256 normal[3], z = _mm256_setzero_ps();
-    float s[8];
+    float s[8], l = n[0] * n[0] + n[1] * n[1] + n[2] * n[2];
     uint32_t k;
-    if (handle->jump == 0 || handle->alpha >= 1 || !(n[0] * n[0] + n[1] * n[1] + n[2] * n[2] > 0.5f))
+    if (handle->jump == 0 || handle->alpha >= 1 || !(l > 0.5f && l < 2))
         return;
     for (k = 0; k < 3; ++k)
         normal[k] = _mm256_set1_ps(n[k]);
@@ -4010,14 +4015,16 @@ GSD_API gsd_result gsd_validate(const gsd_field *field)
     float bins[3 * GSDI_BINS];
     uint32_t i;
     for (i = 0; i < b->roots; ++i)
-        if (i < 4 && (view.nodes[i].leaf.child || memcmp(&view.nodes[i].leaf.pdf, &view.nodes[0].leaf.pdf, 4) ||
+        if (i < 4 && (view.nodes[i].leaf.child || view.nodes[i].leaf.x || view.nodes[i].leaf.y ||
+                      memcmp(&view.nodes[i].leaf.pdf, &view.nodes[0].leaf.pdf, 4) ||
                       !(fabsf(view.nodes[i].leaf.pdf - GSD_INV_4PI) < 1e-7f)))
             return GSD_CORRUPT;
     if (field->target < GSD_TARGET_RADIANCE || field->target > GSD_TARGET_VARIANCE ||
         !(field->first_pass_samples >= 0 && field->first_pass_samples < 1e18) ||
         !(field->last_pass_samples >= 0 && field->last_pass_samples < 1e18) ||
         !(field->all_samples >= 0 && field->all_samples < 1e18) ||
-        !(field->held_samples >= 0 && field->held_samples < 1e18))
+        !(field->held_samples >= 0 && field->held_samples < 1e18) || !gsdi_share_ok(field->stats.closed_share) ||
+        !gsdi_share_ok(field->stats.mean_alpha))
         return GSD_CORRUPT;
     gsdi_bin_means(bins);
     for (i = 0; i < 3 * GSDI_BINS; ++i) /* libraries may round sines differently */

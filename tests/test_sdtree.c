@@ -483,6 +483,39 @@ static void test_alias_samples_follow_the_density(void **state)
         chi_square_of(true, 12, 7 + s);
 }
 
+/* One leaf holds nearly all; tens of thousands of others fill their slots of the alias table from it, one by one. */
+static void test_alias_table_of_a_hot_leaf_adds_up(void **state)
+{
+    (void)state;
+    enum { INNER = 20000 };
+    seed(31);
+    gsd_tree t = random_tree(0, INNER, 16);
+    for (uint32_t i = 0; i < t.count * 4; ++i)
+        t.value[i] = 1e-4f * t.value[i];
+    t.value[3] = t.child[3] ? 0 : 3e4f;
+    t.value[t.count * 4 - 1] = 3e4f;
+    gsd_field *f = forest_of_trees(&t, 1, (gsd_desc){.alias = true});
+    gsd_view v = gsd_get_view(f);
+    gsd_handle h = gsd_find_cell(&v, 0);
+    uint32_t nodes = f->block->nodes;
+    double *share = calloc(nodes, sizeof *share), worst = 0, e = (double)v.uniform;
+    assert_true(h.alias_count > INNER);
+    for (uint32_t i = 0; i < h.alias_count; ++i) {
+        const gsd_alias *a = &v.aliases[h.alias + i];
+        share[a->node] += (double)a->threshold / h.alias_count;
+        share[a->other] += (1 - (double)a->threshold) / h.alias_count;
+    }
+    for (uint32_t i = 0; i < nodes; ++i) {
+        const gsd_node *n = &v.nodes[i];
+        double area = 4 * PI * pow(0.25, n->leaf.x >> 24);
+        if (n->leaf.child == 0 && i >= f->block->roots)
+            worst = fmax(worst, fabs(share[i] - ((double)n->leaf.pdf - e / (4 * PI)) / (1 - e) * area));
+    }
+    assert_true(worst < 1e-6);
+    free(share);
+    gsd_destroy(f);
+}
+
 /* Within one leaf samples are uniform: chi-square on 16 x 16 of the one leaf that holds everything. */
 static void test_samples_are_uniform_within_a_leaf(void **state)
 {
@@ -1047,6 +1080,30 @@ static void test_odd_normals_do_no_harm(void **state)
             }
             gsd_destroy(f);
         }
+}
+
+/* Huge normals overflowed where all light is on the other side. */
+static void test_normals_far_from_unit_are_none(void **state)
+{
+    (void)state;
+    const float normals[][3] = {{3e38f, 0, 0}, {-3e38f, 0, 0}, {1e20f, 0, 0}, {1e4f, 0, 0}, {1.5f, 0, 0}, {0.6f, 0, 0}};
+    gsd_tree t = {0, 1, calloc(4, sizeof(uint32_t)), calloc(4, sizeof(float))};
+    t.value[0] = 1;
+    gsd_field *f = forest_of_trees(&t, 1, (gsd_desc){.uniform = 0});
+    gsd_view v = gsd_get_view(f);
+    for (unsigned k = 0; k < sizeof normals / sizeof *normals; ++k) {
+        gsd_handle plain = gsd_find_cell(&v, 0), h = plain, found;
+        float position[3] = {0, 0, 0};
+        gsd_orient(&v, &h, normals[k]);
+        assert_true(h.product == 0);
+        gsd_find_batch(&v, 1, NULL, position, 12, normals[k], 12, NULL, 0, &found, NULL);
+        assert_true(found.product == 0);
+        for (int draw = 0; draw < 40; ++draw) {
+            float u[2] = {rndf(), rndf()}, d[3];
+            assert_true(gsd_sample(&v, &h, u, d) == gsd_pdf(&v, &plain, d));
+        }
+    }
+    gsd_destroy(f);
 }
 
 /* ---- the normal in a sample */
@@ -2828,6 +2885,68 @@ static void test_forged_saves_never_harm(void **state)
     free(forged);
 }
 
+/* gsd_record_fraction is 1/64 .. 1 for whatever loads. */
+static void test_forged_shares_of_the_gate_are_refused(void **state)
+{
+    (void)state;
+    const float bad[] = {NAN, INFINITY, -INFINITY, -0.5f, 1.5f, 3e38f};
+    size_t size;
+    unsigned char *data = small_save(&size);
+    for (unsigned k = 0; k < 2 * sizeof bad / sizeof *bad; ++k) {
+        gsdi_file f;
+        gsd_field *g;
+        memcpy(&f, data, sizeof f);
+        *(k % 2 ? &f.stats.closed_share : &f.stats.mean_alpha) = bad[k / 2];
+        f.checksum = gsdi_file_checksum(&f, data + sizeof f, size - sizeof f);
+        unsigned char *forged = malloc(size);
+        memcpy(forged, data, size);
+        memcpy(forged, &f, sizeof f);
+        assert_int_equal(gsd_load(NULL, forged, size, &g), GSD_BAD_FILE);
+        assert_null(g);
+        free(forged);
+    }
+    free(data);
+}
+
+/* The uniform leaf lies at 0, 0, depth 0: a query shifts by its depth. */
+static void test_a_forged_uniform_leaf_is_refused(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    gsd_field *f;
+    OK(gsd_create(&d, &f));
+    for (uint32_t i = 0; i < 4; ++i) {
+        gsd_node *n = &gsdi_nodes(f->block)[i];
+        n->leaf.x = 200u << 24;
+        assert_int_equal(gsd_validate(f), GSD_CORRUPT);
+        n->leaf.x = 0;
+        n->leaf.y = 1;
+        assert_int_equal(gsd_validate(f), GSD_CORRUPT);
+        n->leaf.y = 0;
+        OK(gsd_validate(f));
+    }
+    gsd_destroy(f);
+}
+
+/* A save may claim that a cell reflects 1e49 a sample: it is whole, and still is after refine. */
+static void test_a_huge_flow_leaves_the_field_valid(void **state)
+{
+    (void)state;
+    gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+    gsd_field *f;
+    static gsd_training_sample s[100];
+    seed(3);
+    OK(gsd_create(&d, &f));
+    f->states[0].flow = 1e49;
+    OK(gsd_validate(f));
+    gsd_view v = gsd_get_view(f);
+    make_samples(&v, s, 100);
+    learn(f, s, 100);
+    OK(gsd_refine(f, NULL, NULL, NULL));
+    OK(gsd_validate(f));
+    gsd_destroy(f);
+}
+
 static void test_merge_equals_training_together(void **state)
 {
     (void)state;
@@ -2915,6 +3034,7 @@ int main(void)
         cmocka_unit_test(test_pdf_integrates_to_one),
         cmocka_unit_test(test_samples_follow_the_density),
         cmocka_unit_test(test_alias_samples_follow_the_density),
+        cmocka_unit_test(test_alias_table_of_a_hot_leaf_adds_up),
         cmocka_unit_test(test_samples_are_uniform_within_a_leaf),
         cmocka_unit_test(test_sample_and_pdf_agree),
         cmocka_unit_test(test_estimates_with_the_density_are_unbiased),
@@ -2927,6 +3047,7 @@ int main(void)
         cmocka_unit_test(test_oriented_samples_at_edges_of_bins),
         cmocka_unit_test(test_cells_of_a_forest_are_oriented),
         cmocka_unit_test(test_odd_normals_do_no_harm),
+        cmocka_unit_test(test_normals_far_from_unit_are_none),
         cmocka_unit_test(test_normals_survive_packing),
         cmocka_unit_test(test_batches_equal_single_queries_at_every_level),
         cmocka_unit_test(test_batches_of_oriented_handles_equal_single_queries),
@@ -2965,6 +3086,9 @@ int main(void)
         cmocka_unit_test(test_save_and_load_give_the_same_field),
         cmocka_unit_test(test_truncated_and_flipped_saves_are_refused),
         cmocka_unit_test(test_forged_saves_never_harm),
+        cmocka_unit_test(test_forged_shares_of_the_gate_are_refused),
+        cmocka_unit_test(test_a_forged_uniform_leaf_is_refused),
+        cmocka_unit_test(test_a_huge_flow_leaves_the_field_valid),
         cmocka_unit_test(test_merge_equals_training_together),
         cmocka_unit_test(test_validate_notices_damage),
     };
