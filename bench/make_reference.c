@@ -339,8 +339,8 @@ typedef struct job {
 typedef struct answer {
     bool ok;
     int spp;
-    double cpu;
-    uint64_t bad; /* samples that were not finite and dropped */
+    double cpu, render_cpu; /* with and without loading the scene */
+    uint64_t bad;           /* samples that were not finite and dropped */
     char err[512];
 } answer;
 
@@ -416,6 +416,7 @@ static bool child_render(const options *o, const job *j, child_progress *progres
         a.spp = result.spp;
         a.bad = result.bad_samples;
         a.cpu = tr_cpu_seconds();
+        a.render_cpu = result.cpu_seconds;
     }
     size_t bytes = 3 * (size_t)o->width * (size_t)o->height * sizeof(float);
     bool sent = write_all(fd, &a, sizeof a) && (!a.ok || write_all(fd, result.color.data, bytes));
@@ -937,10 +938,10 @@ static bool find_spp(session *w)
         if (w->s.h.spp[m])
             continue;
         job j = make_job(w, m, PILOT_NUMBER);
-        j.seconds = fmin(5, w->o->round_seconds / 8);
+        j.seconds = fmin(5, w->o->round_seconds / 4);
         if (!do_job(w, &j, &a))
             return false;
-        double spp = floor(a.spp * w->o->round_seconds / fmax(a.cpu, 1e-3));
+        double spp = floor(a.spp * w->o->round_seconds / fmax(a.render_cpu, 1e-3));
         w->s.h.spp[m] = (int32_t)fmin(fmax(spp, 1), 1 << 24);
         w->s.h.other_cpu += a.cpu;
     }
