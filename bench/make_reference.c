@@ -902,6 +902,8 @@ static int write_reference(const options *o, const state *s, const quality *q, c
     if (!ok)
         return die("%s: cannot write the picture: %s", o->out, err);
     struct stat file;
+    if (o->quiet)
+        return 0;
     printf("%s: %.0f kB, %s\n  own relMSE %s, wanted %s\n  check: %s\n  %.0f CPU s (%s %.0f, %s %.0f)\n", o->out,
            stat(o->out, &file) == 0 ? (double)file.st_size / 1000 : 0, samples, relmse, goal, check,
            s->h.cpu[MAIN] + s->h.cpu[CHECK] + s->h.other_cpu, o->method, s->h.cpu[MAIN], o->check, s->h.cpu[CHECK]);
