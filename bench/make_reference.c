@@ -339,8 +339,8 @@ typedef struct job {
 typedef struct answer {
     bool ok;
     int spp;
-    double cpu;
-    uint64_t bad; /* samples that were not finite and dropped */
+    double cpu, render_cpu; /* with and without loading the scene */
+    uint64_t bad;           /* samples that were not finite and dropped */
     char err[512];
 } answer;
 
@@ -416,6 +416,7 @@ static bool child_render(const options *o, const job *j, child_progress *progres
         a.spp = result.spp;
         a.bad = result.bad_samples;
         a.cpu = tr_cpu_seconds();
+        a.render_cpu = result.cpu_seconds;
     }
     size_t bytes = 3 * (size_t)o->width * (size_t)o->height * sizeof(float);
     bool sent = write_all(fd, &a, sizeof a) && (!a.ok || write_all(fd, result.color.data, bytes));
@@ -698,8 +699,8 @@ static bool judge(const options *o, const state *s, quality *q)
 /* ---- >>check ------------------------------------------------------------------------------------------------ */
 
 typedef struct tile {
-    bool tested;
-    double z, ratio; /* of the channel that differs most; the reference's mean over the check's */
+    bool tested, usable; /* usable: its own variances can be believed; tested: those of its neighbours too */
+    double z, ratio;     /* of the channel that differs most; the reference's mean over the check's */
 } tile;
 
 typedef struct verdict {
@@ -733,13 +734,13 @@ static bool tile_statistics(const state *s, int method, const int box[4], int ch
 /* All channels of a tile count: where one cannot be tested, the tile is left out. */
 static tile test_tile(const state *s, const int box[4])
 {
-    tile t = {true, 0, 1};
+    tile t = {.usable = true, .ratio = 1};
     for (int c = 0; c < 3; ++c) {
         double m[METHODS], v[METHODS];
         bool usable = tile_statistics(s, MAIN, box, c, &m[MAIN], &v[MAIN]);
         usable = tile_statistics(s, CHECK, box, c, &m[CHECK], &v[CHECK]) && usable;
         if (!usable || (v[MAIN] > 0) != (v[CHECK] > 0)) { /* no variance at all: that method has found nothing yet */
-            t.tested = false;
+            t.usable = false;
             return t;
         }
         /* Pixels that are the same in every round: an emitter, or black. Rounding is then the only noise. */
@@ -768,6 +769,17 @@ static double z_limit(double probability)
     return high;
 }
 
+/* Rare bright paths reach whole regions: a tile among such ones that looks calm has only not met its own yet, and would
+   be too dark by more than its variance says. So a tile counts only where all its neighbours are usable. */
+static bool neighbours_usable(const verdict *c, int column, int row)
+{
+    for (int y = row > 0 ? row - 1 : 0; y <= row + 1 && y < c->down; ++y)
+        for (int x = column > 0 ? column - 1 : 0; x <= column + 1 && x < c->across; ++x)
+            if (!c->tiles[y * c->across + x].usable)
+                return false;
+    return true;
+}
+
 /* Do the two methods agree? Bonferroni over channels and tiles, among those that can be tested. */
 static bool run_check(const state *s, verdict *c)
 {
@@ -784,9 +796,13 @@ static bool run_check(const state *s, verdict *c)
         int box[4] = {x, y, x + TILE < s->h.width ? x + TILE : s->h.width,
                       y + TILE < s->h.height ? y + TILE : s->h.height};
         c->tiles[i] = test_tile(s, box);
-        c->tested += c->tiles[i].tested;
-        c->left_out += !c->tiles[i].tested;
-        c->worst = c->tiles[i].tested ? fmax(c->worst, c->tiles[i].z) : c->worst;
+    }
+    for (int i = 0; i < c->across * c->down; ++i) {
+        tile *t = &c->tiles[i];
+        t->tested = neighbours_usable(c, i % c->across, i / c->across);
+        c->tested += t->tested;
+        c->left_out += !t->tested;
+        c->worst = t->tested ? fmax(c->worst, t->z) : c->worst;
     }
     c->limit = c->tested ? z_limit(CHECK_ALPHA / (3.0 * c->tested)) : 0;
     for (int i = 0; i < c->across * c->down; ++i)
@@ -886,6 +902,8 @@ static int write_reference(const options *o, const state *s, const quality *q, c
     if (!ok)
         return die("%s: cannot write the picture: %s", o->out, err);
     struct stat file;
+    if (o->quiet)
+        return 0;
     printf("%s: %.0f kB, %s\n  own relMSE %s, wanted %s\n  check: %s\n  %.0f CPU s (%s %.0f, %s %.0f)\n", o->out,
            stat(o->out, &file) == 0 ? (double)file.st_size / 1000 : 0, samples, relmse, goal, check,
            s->h.cpu[MAIN] + s->h.cpu[CHECK] + s->h.other_cpu, o->method, s->h.cpu[MAIN], o->check, s->h.cpu[CHECK]);
@@ -937,10 +955,10 @@ static bool find_spp(session *w)
         if (w->s.h.spp[m])
             continue;
         job j = make_job(w, m, PILOT_NUMBER);
-        j.seconds = fmin(5, w->o->round_seconds / 8);
+        j.seconds = fmin(5, w->o->round_seconds / 4);
         if (!do_job(w, &j, &a))
             return false;
-        double spp = floor(a.spp * w->o->round_seconds / fmax(a.cpu, 1e-3));
+        double spp = floor(a.spp * w->o->round_seconds / fmax(a.render_cpu, 1e-3));
         w->s.h.spp[m] = (int32_t)fmin(fmax(spp, 1), 1 << 24);
         w->s.h.other_cpu += a.cpu;
     }

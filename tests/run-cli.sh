@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # The programs' command lines: what they refuse, what they say, what they write. Speaks TAP.
-# Each case runs $program of $BUILD, the renderer at first, on tiny scenes written here; exit 1 with a message is asked for, never a signal.
+# Each case runs $program of $BUILD, the renderer at first, on tiny scenes written here; exit 1 with a message is asked
+# for, never a signal.
 export LC_ALL=C
 cd "$(dirname "$0")/.." || exit 1
 render=$PWD/${BUILD:-build}/render
