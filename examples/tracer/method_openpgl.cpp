@@ -326,6 +326,7 @@ double column(const std::string &header, const std::string &row, const std::stri
         size_t h_end = header.find(',', h), r_end = row.find(',', r);
         std::string title = header.substr(h, h_end - h);
         title.erase(0, title.find_first_not_of(' '));
+        title.erase(title.find_last_not_of(' ') + 1); /* npos + 1 is 0 */
         if (title == name)
             return strtod(row.c_str() + r, nullptr);
         if (h_end == std::string::npos || r_end == std::string::npos)
@@ -343,16 +344,19 @@ void stats(void *data, tr_method_stats *out)
     out->samples = m->samples + m->zeros;
     out->refused = m->refused;
     out->extra_bytes = (double)m->stored_peak;
-    double components = 0;
+    double components = 0, nodes = 0;
     if (m->updates) {
         pgl::FieldStatistics s = m->field->GetSurfaceStatistics();
         std::string header = s.HeaderCSVString(), row = s.ToCSVString();
         out->cells = (uint64_t)column(header, row, "numCacheRegions");
-        out->bytes = out->cells * (uint64_t)column(header, row, "sizePerCacheRegions(bs)");
+        nodes = column(header, row, "numberOfNodes");
+        out->bytes = out->cells * (uint64_t)column(header, row, "sizePerCacheRegions(bs)") +
+                     (uint64_t)column(header, row, "sizeAllNodesUsed");
         components = column(header, row, "averageNumberOfComponents");
     }
-    snprintf(out->json, sizeof out->json, "\"updates\": %u, \"zeros\": %llu, \"mean_components\": %.3f", m->updates,
-             (unsigned long long)m->zeros, components);
+    snprintf(out->json, sizeof out->json,
+             "\"updates\": %u, \"zeros\": %llu, \"nodes\": %.0f, \"mean_components\": %.3f", m->updates,
+             (unsigned long long)m->zeros, nodes, components);
 }
 
 tr_method describe_method()
