@@ -10,7 +10,7 @@
 #
 #   config=release|debug|scalar|sanitize|tsan|coverage    each has its own folder (build/, build-debug/, ...)
 #   CC=clang  V=1  WERROR=1  NO_INSTALL=1  TESTS="sdtree bsdf"  GUIDE_SCENES=folder with downloaded scenes
-#   DEMO_SECONDS=40  DEMO_SIZE=320x180
+#   OPENPGL_DIR=installation of Intel Open PGL: builds the renderer's method openpgl   DEMO_SECONDS=40  DEMO_SIZE=320x180
 
 config ?= release
 DEMO_SECONDS ?= 40
@@ -20,6 +20,9 @@ STRESS_SEED ?= 1
 
 ifeq ($(origin CC),default)
 CC := $(firstword $(foreach c,gcc clang,$(if $(shell command -v $(c) 2>/dev/null),$(c))) cc)
+endif
+ifeq ($(origin CXX),default)
+CXX := $(firstword $(foreach c,$(if $(findstring clang,$(CC)),clang++) g++ clang++,$(if $(shell command -v $(c) 2>/dev/null),$(c))) c++)
 endif
 AR ?= ar
 
@@ -56,12 +59,26 @@ CPPFLAGS_ALL = -D_POSIX_C_SOURCE=200809L -I. -Iexamples/tracer $(PREFIX_INC) $(C
 LDFLAGS_ALL = $(filter -fsanitize% --coverage,$($(config)_FLAGS)) -pthread $(PREFIX_LIB) $(LDFLAGS)
 LIBS := -l$(or $(EMBREE),embree3) -lOpenEXRCore -lexpat -lassimp -lz -lm -lpthread
 
+# Intel Open PGL is optional: one C++ file adapts it, and what is linked needs the C++ library then.
+ifneq ($(OPENPGL_DIR),)
+OPENPGL_PREFIX := $(abspath $(OPENPGL_DIR))
+OPENPGL_LIB := $(patsubst %/,%,$(dir $(firstword $(wildcard $(foreach d,lib lib64 lib/*,$(OPENPGL_PREFIX)/$d/libopenpgl.*)))))
+ifeq ($(and $(OPENPGL_LIB),$(wildcard $(OPENPGL_PREFIX)/include/openpgl/cpp/OpenPGL.h)),)
+$(error OPENPGL_DIR=$(OPENPGL_DIR) has no include/openpgl/cpp/OpenPGL.h or no lib/libopenpgl)
+endif
+CXXFLAGS_ALL = -std=c++17 $($(config)_FLAGS) -ffp-contract=off $(filter-out -Wstrict-prototypes,$(WARN)) -pthread \
+	-isystem $(OPENPGL_PREFIX)/include $(CXXFLAGS)
+CPPFLAGS_ALL += -DTR_OPENPGL
+LDFLAGS_ALL += -L$(OPENPGL_LIB) -Wl,-rpath,$(OPENPGL_LIB)
+LIBS += -lopenpgl -ltbb -lstdc++
+endif
+
 # ---- files ----------------------------------------------------------------------------------------------------
 
 HEADERS := $(wildcard guide_*.h)
 TRACER_MAINS := render imgerr
 TRACER_SRC := $(filter-out $(TRACER_MAINS:%=examples/tracer/%.c),$(wildcard examples/tracer/*.c))
-TRACER_OBJ := $(TRACER_SRC:examples/tracer/%.c=$(B)/obj/tracer/%.o)
+TRACER_OBJ := $(TRACER_SRC:examples/tracer/%.c=$(B)/obj/tracer/%.o) $(if $(OPENPGL_DIR),$(B)/obj/tracer/method_openpgl.o)
 PROGRAMS := $(patsubst examples/tracer/%.c,$(B)/%,$(wildcard $(TRACER_MAINS:%=examples/tracer/%.c)))
 EXAMPLES := $(patsubst examples/%.c,$(B)/examples/%,$(wildcard examples/*.c))
 TESTS_ALL := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/test_*.c))
@@ -73,7 +90,7 @@ BENCH_MAINS := make_reference
 BENCH_TOOLS := $(patsubst bench/%.c,$(B)/%,$(wildcard $(BENCH_MAINS:%=bench/%.c)))
 # TESTS="a b" picks test_a and test_b, and "matrix", "rig", "cli"; empty = all.
 TEST_PROGRAMS := $(if $(TESTS),$(filter $(TESTS:%=$(B)/tests/test_%),$(TESTS_ALL)),$(TESTS_ALL))
-SOURCES := $(sort $(HEADERS) $(wildcard examples/*.c examples/tracer/*.[ch] tests/*.[ch] tests/*/*.[ch] bench/*.[ch]))
+SOURCES := $(sort $(HEADERS) $(wildcard examples/*.c examples/tracer/*.[ch] examples/tracer/*.cpp tests/*.[ch] tests/*/*.[ch] bench/*.[ch]))
 SCRIPTS := .ci/run $(wildcard tests/*.sh examples/*.sh bench/*.sh)
 
 .PHONY: all programs deps check-deps demo test stress run-demo run-test run-stress expected-count bench run-bench bench-readme bench-error run-bench-error format lint clean help
@@ -98,16 +115,22 @@ Q := $(if $(V),,@)
 SAY = $(if $(V),@:,@printf '%-4s %s\n')
 
 # Rewritten only when the flags change, so that a change of flags rebuilds.
+BUILD_FLAGS = $(strip $(CC) $(CFLAGS_ALL) $(CPPFLAGS_ALL) $(LDFLAGS_ALL) $(LIBS) $(if $(OPENPGL_DIR),$(CXX) $(CXXFLAGS_ALL)))
 $(B)/flags: FORCE
 	@mkdir -p $(B)
-	@printf '%s\n' '$(CC) $(CFLAGS_ALL) $(CPPFLAGS_ALL) $(LDFLAGS_ALL) $(LIBS)' | cmp -s - $@ || \
-		printf '%s\n' '$(CC) $(CFLAGS_ALL) $(CPPFLAGS_ALL) $(LDFLAGS_ALL) $(LIBS)' > $@
+	@printf '%s\n' '$(BUILD_FLAGS)' | cmp -s - $@ || \
+		printf '%s\n' '$(BUILD_FLAGS)' > $@
 FORCE:
 
 $(B)/obj/tracer/%.o: examples/tracer/%.c $(B)/flags
 	$(SAY) CC $<
 	$(Q)mkdir -p $(@D)
 	$(Q)$(CC) $(CFLAGS_ALL) $(TRACER_FLAGS) $(CPPFLAGS_ALL) -MMD -MP -c $< -o $@
+
+$(B)/obj/tracer/%.o: examples/tracer/%.cpp $(B)/flags
+	$(SAY) CXX $<
+	$(Q)mkdir -p $(@D)
+	$(Q)$(CXX) $(CXXFLAGS_ALL) $(TRACER_FLAGS) $(CPPFLAGS_ALL) -MMD -MP -c $< -o $@
 
 $(B)/obj/%.o: %.c $(B)/flags
 	$(SAY) CC $<

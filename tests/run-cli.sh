@@ -76,6 +76,11 @@ refuses 'missing scene file names it' 'absent\.xml' absent.xml $quick
 refuses 'unknown option names it' 'frobnicate' good.xml --frobnicate $quick
 refuses 'option without its value' 'method' good.xml --method
 refuses 'unknown method names it' 'nosuch' good.xml --method nosuch $quick
+if "$render" --help | grep -q '^ *openpgl .*not built'; then
+    refuses 'openpgl where it is not built: says how' 'openpgl.*not built.*make OPENPGL_DIR=' good.xml --method openpgl $quick
+else
+    completes 'openpgl where it is built: renders' good.xml --method openpgl $quick -o openpgl.exr
+fi
 refuses 'unknown --set key names it' 'nokey' good.xml --method sdtree --set nokey=1 $quick
 refuses '--set on a method without options' 'nokey' good.xml --method pt --set nokey=1 $quick
 refuses '--set without =' 'set' good.xml --method sdtree --set nokey $quick

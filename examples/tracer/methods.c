@@ -18,7 +18,24 @@ static const tr_method pt_method = {
 
 extern const tr_method tr_method_sdtree;
 
-static const tr_method *const methods[] = {&pt_method, &tr_method_sdtree, NULL};
+#ifdef TR_OPENPGL
+extern const tr_method tr_method_openpgl;
+#else
+/* Stands in for method_openpgl.cpp, to say how to get it. */
+static void *openpgl_create(tr_method_env *env, char *err, size_t err_size)
+{
+    (void)env;
+    snprintf(err, err_size, "method 'openpgl' is not built: make OPENPGL_DIR=/path/to/installation");
+    return NULL;
+}
+
+static const tr_method tr_method_openpgl = {.name = "openpgl",
+                                            .summary = "Intel Open PGL (not built: make OPENPGL_DIR=...)",
+                                            .create = openpgl_create,
+                                            .destroy = free};
+#endif
+
+static const tr_method *const methods[] = {&pt_method, &tr_method_sdtree, &tr_method_openpgl, NULL};
 
 const tr_method *const *tr_method_list(void) { return methods; }
 

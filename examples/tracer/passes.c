@@ -522,6 +522,7 @@ static bool create_method(render_state *r, char *err, size_t err_size)
                          .tiles = r->frame.tiles_x * r->frame.tiles_y,
                          .nee = r->frame.nee,
                          .seed = s->seed,
+                         .threads = s->threads > 0 ? s->threads : tr_cpu_count(),
                          .parallel = tr_pool_run,
                          .parallel_user = r->pool,
                          .options = s->options,

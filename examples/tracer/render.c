@@ -28,7 +28,7 @@ typedef struct options {
 
 static const char usage_text[] =
     "usage: render SCENE.xml|SCENE.gltf|SCENE.glb [options]\n"
-    "  --method NAME         pt (default), sdtree\n"
+    "  --method NAME         guiding method (default pt), listed below\n"
     "  --set key=value       option of the method (repeatable)\n"
     "  --spp N               budget in samples per pixel, or\n"
     "  --seconds S           budget in CPU seconds over all threads, learning included\n"
@@ -378,6 +378,9 @@ int main(int argc, char **argv)
     for (int i = 1; i < argc; ++i)
         if (!strcmp(argv[i], "--help") || !strcmp(argv[i], "-h")) {
             fputs(usage_text, stdout);
+            puts("methods:");
+            for (const tr_method *const *m = tr_method_list(); *m; ++m)
+                printf("  %-21s %s\n", (*m)->name, (*m)->summary);
             return 0;
         }
     if (parse(&o, argc, argv) || check_outputs(&o))

@@ -438,6 +438,7 @@ typedef struct tr_method_env {
     int tiles; /* streams that record is called with: 0 .. tiles - 1 */
     bool nee;
     uint64_t seed;
+    int threads; /* that `parallel` uses: for methods with threads of their own */
     tr_parallel_fn parallel;
     void *parallel_user;
     tr_option *options;

@@ -1,0 +1,386 @@
+/* method_openpgl.cpp: Intel Open PGL as a method of the example renderer, to compare with. Built where
+   `make OPENPGL_DIR=/path` names an installation; uses nothing but its public headers.
+
+   Options (--set key=value), defaults as in Open PGL: distribution=pavmm|vmm|quadtree (pavmm: parallax-aware mixture),
+   leaf_size (samples of a cell before it splits, 32000), knn=on|off (stochastic lookup among near cells),
+   deterministic=on|off, product=on|off (with the cosine, mixtures only), alpha (probability of bsdf sampling, 0.5). */
+#include <atomic>
+#include <cmath>
+#include <cstdlib>
+#include <cstring>
+#include <memory>
+#include <mutex>
+#include <new>
+#include <string>
+#include <vector>
+
+#include <openpgl/cpp/OpenPGL.h>
+
+#include "embree.h"
+extern "C" {
+#include "tracer.h"
+extern const tr_method tr_method_openpgl;
+}
+
+namespace pgl = openpgl::cpp;
+
+namespace
+{
+
+/* What PathSegmentStorage does to the samples it makes: densities below min_pdf are raised to it, and light from the
+   environment counts as coming from afar. */
+const float min_pdf = 0.01f;
+const float far_away = 1e6f;
+/* Learn within a pass when it has recorded as much: bounds the memory. */
+const size_t most_samples = (size_t)1 << 22;
+
+/* A lookup's slot. Slots are the workers' memory, zero at first and never handed back: the distribution stays with its
+   slot, for it is large and slow to allocate, and the method frees it. */
+struct slot {
+    pgl::SurfaceSamplingDistribution *distribution;
+};
+
+struct method {
+    std::unique_ptr<pgl::Device> device;
+    std::unique_ptr<pgl::Field> field;
+    std::unique_ptr<pgl::SampleStorage> storage; /* takes samples from several threads */
+    std::vector<std::unique_ptr<pgl::SurfaceSamplingDistribution>> pool;
+    std::mutex pool_lock;
+    std::atomic<uint64_t> refused{0}; /* directions not traced, or samples not finite */
+    uint64_t samples = 0, zeros = 0;
+    size_t stored_peak = 0; /* bytes */
+    unsigned updates = 0;
+    float alpha = 0.5f;
+    bool product = true, quadtree = false;
+};
+
+pgl_vec3f vector(vec3 a) { return {a.x, a.y, a.z}; }
+
+/* ---- options */
+
+struct parser {
+    tr_method_env *env;
+    std::string error;
+
+    const char *option(const char *key)
+    {
+        for (int i = 0; i < env->option_count; ++i)
+            if (!strcmp(env->options[i].key, key)) {
+                env->options[i].used = true;
+                return env->options[i].value;
+            }
+        return nullptr;
+    }
+
+    void complain(const char *key, const char *value, const std::string &expected)
+    {
+        if (error.empty())
+            error = std::string("--set ") + key + "=" + value + ": expected " + expected;
+    }
+
+    /* Index of the value among the names, 0 where the option was not given. */
+    size_t choice(const char *key, const std::vector<std::string> &names)
+    {
+        const char *value = option(key);
+        std::string all;
+        for (size_t i = 0; value && i < names.size(); ++i) {
+            if (names[i] == value)
+                return i;
+            all += (i ? "|" : "") + names[i];
+        }
+        if (value)
+            complain(key, value, all);
+        return 0;
+    }
+
+    double number(const char *key, double fallback, double least, double most)
+    {
+        const char *value = option(key);
+        if (!value)
+            return fallback;
+        char *end;
+        double x = strtod(value, &end);
+        if (end == value || *end || !(x >= least && x <= most)) {
+            char range[80];
+            snprintf(range, sizeof range, "a number from %g to %g", least, most);
+            complain(key, value, range);
+            return fallback;
+        }
+        return x;
+    }
+};
+
+/* ---- life */
+
+/* The widest vectors that both this processor and the library have. */
+PGL_DEVICE_TYPE device_type(size_t threads)
+{
+    std::vector<PGL_DEVICE_TYPE> types;
+#if defined(__x86_64__) || defined(__i386__)
+#ifdef OPENPGL_SUPPORT_DEVICE_TYPE_CPU_16
+    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw") &&
+        __builtin_cpu_supports("avx512vl"))
+        types.push_back(PGL_DEVICE_TYPE_CPU_16);
+#endif
+    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
+        types.push_back(PGL_DEVICE_TYPE_CPU_8);
+#else
+    types.push_back(PGL_DEVICE_TYPE_CPU_8);
+#endif
+    types.push_back(PGL_DEVICE_TYPE_CPU_4);
+    for (PGL_DEVICE_TYPE type : types) /* the classes do not tell whether there is such a device: the functions do */
+        if (PGLDevice device = pglNewDevice(type, threads)) {
+            pglReleaseDevice(device);
+            return type;
+        }
+    return PGL_DEVICE_TYPE_NONE;
+}
+
+bool configure(method *m, tr_method_env *env, char *err, size_t err_size)
+{
+    static const PGL_DIRECTIONAL_DISTRIBUTION_TYPE types[] = {PGL_DIRECTIONAL_DISTRIBUTION_PARALLAX_AWARE_VMM,
+                                                              PGL_DIRECTIONAL_DISTRIBUTION_VMM,
+                                                              PGL_DIRECTIONAL_DISTRIBUTION_QUADTREE};
+    parser p{env, {}};
+    PGL_DIRECTIONAL_DISTRIBUTION_TYPE type = types[p.choice("distribution", {"pavmm", "vmm", "quadtree"})];
+    size_t leaf_size = (size_t)p.number("leaf_size", PGL_TREE_MAX_SAMPLE_PER_LEAF, 16, 1e9);
+    bool knn = p.choice("knn", {"on", "off"}) == 0, deterministic = p.choice("deterministic", {"on", "off"}) == 0;
+    m->product = p.choice("product", {"on", "off"}) == 0;
+    m->alpha = (float)p.number("alpha", 0.5, 0.01, 1); /* 0 would leave to the guide what it has not seen */
+    m->quadtree = type == PGL_DIRECTIONAL_DISTRIBUTION_QUADTREE;
+    if (!p.error.empty()) {
+        snprintf(err, err_size, "%s", p.error.c_str());
+        return false;
+    }
+    size_t threads = (size_t)(env->threads > 0 ? env->threads : 1);
+    PGL_DEVICE_TYPE device = device_type(threads);
+    if (device == PGL_DEVICE_TYPE_NONE) {
+        snprintf(err, err_size, "openpgl: the library has no code for this processor");
+        return false;
+    }
+    m->device.reset(new pgl::Device(device, threads));
+    pgl::FieldConfig config;
+    config.Init(PGL_SPATIAL_STRUCTURE_KDTREE, type, deterministic, leaf_size);
+    config.SetUseKnnLookup(knn);
+    m->field.reset(new pgl::Field(m->device.get(), config));
+    m->storage.reset(new pgl::SampleStorage);
+    m->field->SetSceneBounds({vector(env->scene->bounds_min), vector(env->scene->bounds_max)});
+    return true;
+}
+
+void destroy(void *data) { delete static_cast<method *>(data); }
+
+void *create(tr_method_env *env, char *err, size_t err_size)
+{
+    method *m = nullptr;
+    try {
+        m = new method;
+        if (configure(m, env, err, err_size))
+            return m;
+    } catch (const std::exception &e) {
+        snprintf(err, err_size, "openpgl: %s", e.what());
+    }
+    delete m;
+    return nullptr;
+}
+
+/* ---- passes */
+
+bool begin_pass(void *, const tr_pass *pass) { return !pass->last; }
+
+/* A traced direction is a sample; one that brought no light is counted apart, as Open PGL has it. Directions that were
+   refused before tracing say nothing about the light there. */
+bool record(void *data, int, const tr_vertex *vertices, int n)
+{
+    method *m = static_cast<method *>(data);
+    pgl::SampleData samples[64];
+    size_t count = 0;
+    uint64_t refused = 0;
+    for (int i = 0; i < n; ++i) {
+        const tr_vertex *v = &vertices[i];
+        float L = mean3(v->L), pdf = v->pdf_mix > min_pdf ? v->pdf_mix : min_pdf;
+        float distance = v->distance < far_away ? v->distance : far_away;
+        if ((v->flags & TR_VERTEX_REJECTED) || !std::isfinite(L / pdf) || !(L >= 0) || !(distance > 0)) {
+            ++refused;
+        } else if (L > 0) {
+            pgl::SampleData s{};
+            s.position = vector(v->p);
+            s.direction = vector(v->wi);
+            s.weight = L / pdf;
+            s.pdf = pdf;
+            s.distance = distance;
+            samples[count++] = s;
+        } else {
+            pgl::ZeroValueSampleData s{};
+            s.position = vector(v->p);
+            s.direction = vector(v->wi);
+            m->storage->AddZeroValueSample(s);
+        }
+        if (count == 64 || (i + 1 == n && count)) {
+            m->storage->AddSamples(samples, count);
+            count = 0;
+        }
+    }
+    m->refused += refused;
+    return true;
+}
+
+void learn(method *m)
+{
+    size_t samples = m->storage->GetSizeSurface(), zeros = m->storage->GetSizeZeroValueSurface();
+    size_t bytes = samples * sizeof(pgl::SampleData) + zeros * sizeof(pgl::ZeroValueSampleData);
+    if (samples == 0) /* nothing has been lit yet */
+        return;
+    m->stored_peak = bytes > m->stored_peak ? bytes : m->stored_peak;
+    m->samples += samples;
+    m->zeros += zeros;
+    m->updates++;
+    m->field->Update(*m->storage);
+    m->storage->Clear();
+}
+
+void flush(void *data)
+{
+    method *m = static_cast<method *>(data);
+    if (m->storage->GetSizeSurface() + m->storage->GetSizeZeroValueSurface() >= most_samples)
+        learn(m);
+}
+
+bool end_pass(void *data, const tr_pass *pass)
+{
+    if (!pass->last)
+        learn(static_cast<method *>(data));
+    return true;
+}
+
+/* ---- queries: from several threads, while nothing learns */
+
+bool idle(void *data) { return static_cast<method *>(data)->updates == 0; }
+
+pgl::SurfaceSamplingDistribution *of_slot(method *m, slot *s)
+{
+    if (!s->distribution)
+        try {
+            std::unique_ptr<pgl::SurfaceSamplingDistribution> made(
+                new pgl::SurfaceSamplingDistribution(m->field.get()));
+            std::lock_guard<std::mutex> hold(m->pool_lock);
+            m->pool.push_back(std::move(made));
+            s->distribution = m->pool.back().get();
+        } catch (const std::exception &) {
+            return nullptr; /* unguided then */
+        }
+    return s->distribution;
+}
+
+void find(void *data, const tr_lookup *lookup, void *handles, float *alpha)
+{
+    method *m = static_cast<method *>(data);
+    slot *slots = static_cast<slot *>(handles);
+    for (int i = 0; i < lookup->n; ++i) {
+        pgl::SurfaceSamplingDistribution *d = of_slot(m, &slots[i]);
+        float u = lookup->u ? lookup->u[i][0] : -1; /* below 0: the cell itself */
+        bool found = d && d->Init(m->field.get(), vector(lookup->p[i]), u);
+        if (found && m->product && !m->quadtree && !black3(lookup->side[i]))
+            d->ApplyCosineProduct(vector(lookup->side[i]));
+        alpha[i] = found ? m->alpha : 1;
+    }
+}
+
+float usable(float pdf) { return pdf > 0 && std::isfinite(pdf) ? pdf : 0; }
+
+void sample(void *, int n, const int *index, const void *handles, const float (*u)[2], vec3 *wi, float *pdf)
+{
+    const slot *slots = static_cast<const slot *>(handles);
+    for (int i = 0; i < n; ++i) {
+        int k = index[i];
+        pgl_vec3f d{0, 0, 1};
+        pdf[k] = usable(slots[k].distribution->SamplePDF({u[k][0], u[k][1]}, d));
+        wi[k] = norm3(v3(d.x, d.y, d.z));
+    }
+}
+
+void pdf_of(void *, int n, const int *index, const void *handles, const vec3 *wi, float *pdf)
+{
+    const slot *slots = static_cast<const slot *>(handles);
+    for (int i = 0; i < n; ++i)
+        pdf[index[i]] = usable(slots[index[i]].distribution->PDF(vector(wi[index[i]])));
+}
+
+/* ---- reports */
+
+/* Cell number; how deep it lies is not told. A slot without a distribution was never asked for. */
+void describe(void *, int n, const void *handles, float *cell, float *depth)
+{
+    const slot *slots = static_cast<const slot *>(handles);
+    for (int i = 0; i < n; ++i) {
+        cell[i] = slots[i].distribution ? (float)slots[i].distribution->GetId() : 0;
+        depth[i] = 0;
+    }
+}
+
+/* The number in the column `name` of a table with one row, 0 where there is none. */
+double column(const std::string &header, const std::string &row, const std::string &name)
+{
+    size_t h = 0, r = 0;
+    while (h < header.size() && r < row.size()) {
+        size_t h_end = header.find(',', h), r_end = row.find(',', r);
+        std::string title = header.substr(h, h_end - h);
+        title.erase(0, title.find_first_not_of(' '));
+        title.erase(title.find_last_not_of(' ') + 1); /* npos + 1 is 0 */
+        if (title == name)
+            return strtod(row.c_str() + r, nullptr);
+        if (h_end == std::string::npos || r_end == std::string::npos)
+            break;
+        h = h_end + 1;
+        r = r_end + 1;
+    }
+    return 0;
+}
+
+void stats(void *data, tr_method_stats *out)
+{
+    method *m = static_cast<method *>(data);
+    memset(out, 0, sizeof *out);
+    out->samples = m->samples + m->zeros;
+    out->refused = m->refused;
+    out->extra_bytes = (double)m->stored_peak;
+    double components = 0, nodes = 0;
+    if (m->updates) {
+        pgl::FieldStatistics s = m->field->GetSurfaceStatistics();
+        std::string header = s.HeaderCSVString(), row = s.ToCSVString();
+        out->cells = (uint64_t)column(header, row, "numCacheRegions");
+        nodes = column(header, row, "numberOfNodes");
+        out->bytes = out->cells * (uint64_t)column(header, row, "sizePerCacheRegions(bs)") +
+                     (uint64_t)column(header, row, "sizeAllNodesUsed");
+        components = column(header, row, "averageNumberOfComponents");
+    }
+    snprintf(out->json, sizeof out->json,
+             "\"updates\": %u, \"zeros\": %llu, \"nodes\": %.0f, \"mean_components\": %.3f", m->updates,
+             (unsigned long long)m->zeros, nodes, components);
+}
+
+tr_method describe_method()
+{
+    tr_method t = {};
+    t.name = "openpgl";
+    t.summary = "Intel Open PGL: a tree of directional mixtures";
+    t.handle_size = sizeof(slot);
+    t.learns = true;
+    t.create = create;
+    t.destroy = destroy;
+    t.begin_pass = begin_pass;
+    t.idle = idle;
+    t.find = find;
+    t.sample = sample;
+    t.pdf = pdf_of;
+    t.record = record;
+    t.flush = flush;
+    t.end_pass = end_pass;
+    t.describe = describe;
+    t.stats = stats;
+    return t;
+}
+
+} // namespace
+
+const tr_method tr_method_openpgl = describe_method();
