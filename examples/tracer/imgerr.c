@@ -4,7 +4,8 @@
    imgerr --compare OUT.png IMAGE.exr LABEL [IMAGE LABEL]...   side by side at one exposure
    imgerr --to-png IMAGE.exr OUT.png [EXPOSURE]             tone-mapped
    imgerr --heat OUT.png IMAGE.exr REF.exr                  relative error per pixel: black 0, white 1 and more
-   imgerr --regions IMAGE.exr REF.exr [CLAMP]               means of 6 x 4 regions over the reference's; any two sizes */
+   imgerr --regions IMAGE.exr REF.exr [CLAMP]               means of 6 x 4 regions over the reference's; any two sizes
+ */
 #include "tracer.h"
 
 #include <errno.h>
