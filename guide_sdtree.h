@@ -3986,10 +3986,11 @@ static bool gsdi_state_ok(const gsd_field *field, const gsdi_state *s, const gsd
     gsd_cell should;
     uint32_t k;
     if (c->tree >= field->block->trees || s->gate > GSD_GATE_CLOSED || !(s->alpha >= 0.049f && s->alpha <= 1) ||
-        !(s->theta > -10 && s->theta < 10) || !gsdi_finite(s->moment1) || !gsdi_finite(s->moment2) ||
-        !(s->held >= 0 && s->held < 1e18) || !(s->lit >= 0 && s->lit < 1e18) || !(s->fresh >= 0 && s->fresh < 1e18) ||
-        !(s->flow >= 0 && s->flow < 1e50) || !(s->gate_count >= 0) || !(s->weight >= 0 && s->weight < 1e300) ||
-        !(s->pixel >= 0 && s->pixel < 1e300) || !(s->pixel_v >= 0 && s->pixel_v < 1e300) || s->level > 60)
+        !(s->reflected >= 0 && s->reflected <= 1e30f) || !(s->theta > -10 && s->theta < 10) ||
+        !gsdi_finite(s->moment1) || !gsdi_finite(s->moment2) || !(s->held >= 0 && s->held < 1e18) ||
+        !(s->lit >= 0 && s->lit < 1e18) || !(s->fresh >= 0 && s->fresh < 1e18) || !(s->flow >= 0 && s->flow < 1e50) ||
+        !(s->gate_count >= 0) || !(s->weight >= 0 && s->weight < 1e300) || !(s->pixel >= 0 && s->pixel < 1e300) ||
+        !(s->pixel_v >= 0 && s->pixel_v < 1e300) || s->level > 60)
         return false;
     for (k = 0; k <= GSDI_GATE_LOW; ++k)
         if (!(s->v[k] >= 0 && s->v[k] < 1e300) || !(s->vv[k] >= 0 && s->vv[k] < 1e300))

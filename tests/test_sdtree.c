@@ -2937,6 +2937,12 @@ static void test_a_huge_flow_leaves_the_field_valid(void **state)
     static gsd_training_sample s[100];
     seed(3);
     OK(gsd_create(&d, &f));
+    const float bad[] = {NAN, -1, 2e30f, INFINITY};
+    for (unsigned k = 0; k < 4; ++k) { /* refine copies it into the cell */
+        f->states[0].reflected = bad[k];
+        assert_int_equal(gsd_validate(f), GSD_CORRUPT);
+    }
+    f->states[0].reflected = 0;
     f->states[0].flow = 1e49;
     OK(gsd_validate(f));
     gsd_view v = gsd_get_view(f);
