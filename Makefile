@@ -82,7 +82,7 @@ TRACER_OBJ := $(TRACER_SRC:examples/tracer/%.c=$(B)/obj/tracer/%.o) $(if $(OPENP
 PROGRAMS := $(patsubst examples/tracer/%.c,$(B)/%,$(wildcard $(TRACER_MAINS:%=examples/tracer/%.c)))
 EXAMPLES := $(patsubst examples/%.c,$(B)/examples/%,$(wildcard examples/*.c))
 TESTS_ALL := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/test_*.c))
-MICRO := $(B)/bench_sdtree
+MICRO := $(B)/bench_sdtree $(B)/bench_field
 BENCHES := $(patsubst bench/%.c,$(B)/%,$(wildcard bench/bench_*.c))
 STRESSES := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/stress_*.c))
 # Programs of bench/ that are not timings: `make bench` does not run them.
@@ -271,7 +271,7 @@ run-bench: $(BENCHES)
 	@mkdir -p out
 	@BENCH_FLAGS='$(CFLAGS_ALL)' BENCH_COMMIT="$$(git describe --always --dirty 2>/dev/null)"; \
 	export BENCH_FLAGS BENCH_COMMIT; \
-	for b in $(MICRO); do echo "$$b"; $$b --json out/$${b##*/}.json $(ARGS) || exit 1; done
+	for b in $(MICRO); do echo "$$b"; $$b --json out/$${b##*/}.json || exit 1; done
 
 # Put the figures of the last `make bench` into the README.
 bench-readme:
