@@ -120,6 +120,7 @@ $(B)/flags: FORCE
 	@mkdir -p $(B)
 	@printf '%s\n' '$(BUILD_FLAGS)' | cmp -s - $@ || \
 		printf '%s\n' '$(BUILD_FLAGS)' > $@
+.PHONY: FORCE
 FORCE:
 
 $(B)/obj/tracer/%.o: examples/tracer/%.c $(B)/flags
