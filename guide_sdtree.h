@@ -1627,10 +1627,10 @@ static void gsdi_splat_cells(void *context, uint32_t begin, uint32_t end)
     for (b = begin; b < end; ++b) {
         uint32_t cell = a->busy[b];
         for (i = a->start[cell]; i < a->start[cell + 1]; ++i) {
+            a->field->states[cell].held += 1; /* one by one: sums that refine has scaled round alike for any cut */
             a->field->states[cell].lit += a->items[a->order[i]].pixel > 0;
             gsdi_splat(a, cell, &a->items[a->order[i]]);
         }
-        a->field->states[cell].held += (double)(a->start[cell + 1] - a->start[cell]);
     }
 }
 
