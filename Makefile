@@ -268,7 +268,7 @@ run-demo: $(PROGRAMS)
 bench: deps
 	$(SUB) run-bench
 
-run-bench: $(BENCHES)
+run-bench: $(MICRO)
 	@mkdir -p out
 	@BENCH_FLAGS='$(CFLAGS_ALL)' BENCH_COMMIT="$$(git describe --always --dirty 2>/dev/null)"; \
 	export BENCH_FLAGS BENCH_COMMIT; \

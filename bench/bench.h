@@ -3,6 +3,8 @@
 #ifndef BENCH_H
 #define BENCH_H
 
+#include "statistics.h"
+
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -27,19 +29,13 @@ typedef struct bench_time {
     double spread; /* (third quartile - first quartile) / median */
 } bench_time;
 
-static inline int bench_compare(const void *a, const void *b)
-{
-    double x = *(const double *)a, y = *(const double *)b;
-    return (x > y) - (x < y);
-}
-
 /* Sorts the times. */
 static inline bench_time bench_summary(double *times, int n)
 {
     bench_time t = {0, 0, 0};
     if (n < 1)
         return t;
-    qsort(times, (size_t)n, sizeof *times, bench_compare);
+    qsort(times, (size_t)n, sizeof *times, ascending);
     t.min = times[0];
     t.median = 0.5 * (times[(n - 1) / 2] + times[n / 2]);
     t.spread = (times[3 * (n - 1) / 4] - times[(n - 1) / 4]) / t.median;

@@ -7,6 +7,7 @@
 
 #include "error_rows.h"
 #include "plot.h"
+#include "statistics.h"
 #include "tracer.h"
 
 #define MAX_NAMES 32
@@ -217,17 +218,6 @@ static double tile_variance(const evidence *e, const double variance[2])
     return total;
 }
 
-/* |z| that a normal variable exceeds with probability p, both sides. */
-static double normal_limit(double p)
-{
-    double lo = 0, hi = 40;
-    for (int i = 0; i < 60; ++i) {
-        double mid = 0.5 * (lo + hi);
-        *(erfc(mid / sqrt(2.0)) > p ? &lo : &hi) = mid;
-    }
-    return hi;
-}
-
 static disagreement disagree(const evidence *a, const evidence *b)
 {
     disagreement d = {0, 0, 0, 0, 0, 0, 0};
@@ -396,13 +386,15 @@ static bool plot_cost(const plan *p, const rows *all)
 static int judge_builds(FILE *f, const plan *p, const rows *all, const char *scene)
 {
     int flags = 0;
-    for (int m = 0; m < p->methods.count; ++m)
+    const char *budget = p->budgets.at[p->budgets.count - 1];
+    for (int m = 0; m < p->methods.count && p->builds.count > 1; ++m) {
+        column first = {p->builds.at[0], p->methods.at[m]};
+        evidence eb = gather(p, all, scene, first);
         for (int b = 1; b < p->builds.count; ++b) {
-            column first = {p->builds.at[0], p->methods.at[m]}, other = {p->builds.at[b], p->methods.at[m]};
-            const char *budget = p->budgets.at[p->budgets.count - 1];
+            column other = {p->builds.at[b], p->methods.at[m]};
             estimate speed = ratio_of(p, all, scene, other, first, budget, value_speed);
             estimate error = ratio_of(p, all, scene, other, first, budget, value_relmse);
-            evidence ea = gather(p, all, scene, other), eb = gather(p, all, scene, first);
+            evidence ea = gather(p, all, scene, other);
             disagreement d = disagree(&ea, &eb);
             bool slower = speed.value<SLOWER, biased = fabs(d.z_all)> 5 || fabs(d.z_tile) > d.limit;
             bool worse = error.value > WORSE && !(error.count > 1 && error.low < 1);
@@ -411,8 +403,9 @@ static int judge_builds(FILE *f, const plan *p, const rows *all, const char *sce
                     worse ? " WORSE" : "", d.z_all, fabs(d.z_tile), d.limit, biased ? " BIASED" : "");
             flags += slower + worse + biased;
             evidence_free(&ea);
-            evidence_free(&eb);
         }
+        evidence_free(&eb);
+    }
     return flags;
 }
 

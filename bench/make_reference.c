@@ -16,6 +16,8 @@
      >>output    EXR with its history, heat map
      >>main      loop */
 #define _POSIX_C_SOURCE 200809L
+#include "options.h"
+#include "statistics.h"
 #include "threads.h"
 #include "tracer.h"
 
@@ -114,25 +116,6 @@ static bool parse_size(const char *text, int *w, int *h)
     memcpy(first, text, n);
     first[n] = 0;
     return parse_int(first, 1, 16384, w) && parse_int(text + n + 1, 1, 16384, h);
-}
-
-/* Split key=value in place. */
-static bool parse_pair(char *text, const char **key, const char **value)
-{
-    char *equals = strchr(text, '=');
-    if (!equals || equals == text)
-        return false;
-    *equals = 0;
-    *key = text;
-    *value = equals + 1;
-    return true;
-}
-
-static bool parse_roulette(const char *text, tr_roulette *mode)
-{
-    bool guided = !strcmp(text, "guided"), on = !strcmp(text, "on");
-    *mode = guided ? TR_ROULETTE_GUIDED : on ? TR_ROULETTE_THROUGHPUT : TR_ROULETTE_OFF;
-    return guided || on || !strcmp(text, "off");
 }
 
 static bool apply_text(options *o, const char *name, const char *value)
@@ -616,12 +599,6 @@ typedef struct quality {
     bool known, reached;
 } quality;
 
-static int ascending(const void *a, const void *b)
-{
-    double x = *(const double *)a, y = *(const double *)b;
-    return (x > y) - (x < y);
-}
-
 /* Mean of the rounds of `method` in channel i, and the variance of that mean; needs two rounds. */
 static void mean_variance(const state *s, int method, size_t i, double *mean, double *variance)
 {
@@ -755,20 +732,6 @@ static tile test_tile(const state *s, const int box[4])
     return t;
 }
 
-/* Two-sided normal quantile by bisection. */
-static double z_limit(double probability)
-{
-    double low = 0, high = 38;
-    for (int i = 0; i < 60; ++i) {
-        double z = 0.5 * (low + high);
-        if (erfc(z / sqrt(2)) > probability)
-            low = z;
-        else
-            high = z;
-    }
-    return high;
-}
-
 /* Rare bright paths reach whole regions: a tile among such ones that looks calm has only not met its own yet, and would
    be too dark by more than its variance says. So a tile counts only where all its neighbours are usable. */
 static bool neighbours_usable(const verdict *c, int column, int row)
@@ -804,7 +767,7 @@ static bool run_check(const state *s, verdict *c)
         c->left_out += !t->tested;
         c->worst = t->tested ? fmax(c->worst, t->z) : c->worst;
     }
-    c->limit = c->tested ? z_limit(CHECK_ALPHA / (3.0 * c->tested)) : 0;
+    c->limit = c->tested ? normal_limit(CHECK_ALPHA / (3.0 * c->tested)) : 0;
     for (int i = 0; i < c->across * c->down; ++i)
         c->failed += c->tiles[i].tested && c->tiles[i].z > c->limit;
     return true;

@@ -5,6 +5,7 @@
      >>output   EXR layers, PNG, JSON
      >>main */
 #define _POSIX_C_SOURCE 200809L
+#include "options.h"
 #include "threads.h"
 #include "tracer.h"
 
@@ -88,25 +89,6 @@ static bool parse_switch(const char *text, bool *on)
 {
     *on = !strcmp(text, "on");
     return *on || !strcmp(text, "off");
-}
-
-static bool parse_roulette(const char *text, tr_roulette *mode)
-{
-    bool guided = !strcmp(text, "guided"), on = !strcmp(text, "on");
-    *mode = guided ? TR_ROULETTE_GUIDED : on ? TR_ROULETTE_THROUGHPUT : TR_ROULETTE_OFF;
-    return guided || on || !strcmp(text, "off");
-}
-
-/* Split key=value in place. */
-static bool parse_pair(char *text, const char **key, const char **value)
-{
-    char *equals = strchr(text, '=');
-    if (!equals || equals == text)
-        return false;
-    *equals = 0;
-    *key = text;
-    *value = equals + 1;
-    return true;
 }
 
 /* One option with its value; false = the value is not usable. */
