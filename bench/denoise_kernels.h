@@ -35,7 +35,9 @@
 
 #define BLUR_MARGIN 16u   /* columns on either side */
 #define BLUR_ROWS 4u      /* of a block */
-#define BLUR_COLUMNS 8u   /* of a block */
+#define BLUR_COLUMNS 4u   /* of a block: beside a border three columns of either leaf change */
+#define BLUR_BLOCK 16u    /* floats: one cache line */
+#define BLUR_AHEAD 8u     /* runs that input is fetched ahead: the processor cannot guess where the next one is */
 #define BLUR_MAX_STACK 64 /* of the walk through a quadtree: 3 * depth 20 + 4 is the most */
 
 /* Floats from row to row, in all, and before element (0, 0). */
@@ -149,7 +151,7 @@ static inline void blur_map(const uint32_t *child, uint32_t layer, uint64_t *map
     }
 }
 
-/* Runs of the block rows `from` .. `to` - 1; at most (to - from) * width / 16. Returns their number. */
+/* Runs of the block rows `from` .. `to` - 1; at most (to - from) * width / 8. Returns their number. */
 static inline size_t blur_runs(const uint64_t *map, uint32_t width, uint32_t from, uint32_t to, blur_run *run)
 {
     uint32_t blocks = width / BLUR_COLUMNS, stride = blur_map_stride(width), r, b;
@@ -178,7 +180,7 @@ static inline size_t blur_runs(const uint64_t *map, uint32_t width, uint32_t fro
 
 /* ---- scalar ------------------------------------------------------------------------------------------------- */
 
-/* Four rows, `columns` (a multiple of 8); in and out point to the first element of the first row. */
+/* Four rows, `columns` of them; in and out point to the first element of the first row. */
 static inline void blur_strip(const float *in, size_t stride, float *out, size_t out_stride, uint32_t columns,
                               const float *w)
 {
@@ -212,16 +214,18 @@ static inline void blur_full(const float *in, size_t stride, float *out, size_t 
         blur_strip(in + r * stride, stride, out + r * out_stride, out_stride, width, w);
 }
 
-/* Only the blocks of these runs are written. */
-static inline void blur_masked(const float *in, size_t stride, float *out, size_t out_stride, const blur_run *run,
-                               size_t count, const float w[4])
+/* Only the blocks of these runs, packed: 4 rows of 4, block after block in the order of the runs; out 64-byte aligned,
+   BLUR_BLOCK floats a block. (Written to their places in a matrix instead, most of the time goes into memory: half a
+   line, then somewhere else.) */
+static inline void blur_packed(const float *in, size_t stride, float *out, const blur_run *run, size_t count,
+                               const float w[4])
 {
     size_t i;
-    for (i = 0; i < count; ++i) {
-        size_t r = (size_t)run[i].row * BLUR_ROWS, c = (size_t)run[i].first * BLUR_COLUMNS;
-        blur_strip(in + r * stride + c, stride, out + r * out_stride + c, out_stride,
-                   (uint32_t)(run[i].end - run[i].first) * BLUR_COLUMNS, w);
-    }
+    uint32_t b;
+    for (i = 0; i < count; ++i)
+        for (b = run[i].first; b < run[i].end; ++b, out += BLUR_BLOCK)
+            blur_strip(in + (size_t)run[i].row * BLUR_ROWS * stride + (size_t)b * BLUR_COLUMNS, stride, out,
+                       BLUR_COLUMNS, BLUR_COLUMNS, w);
 }
 
 /* ---- AVX2 --------------------------------------------------------------------------------------------------- */
@@ -256,65 +260,91 @@ BLUR_AVX2_INLINE void blur_columns_avx2(const float *p, size_t stride, const __m
 #define BLUR_SHIFT_AVX2(high, low, n)                                                                                  \
     _mm256_castsi256_ps(_mm256_alignr_epi8(_mm256_castps_si256(high), _mm256_castps_si256(low), 4 * (n)))
 
-/* Eight columns from the vectors `v`, which starts at column -4, and `next`. stream: past the caches. */
-BLUR_AVX2_INLINE void blur_row_avx2(const __m256 *w, __m256 v, __m256 next, float *out, bool stream)
+/* Eight columns from the vectors `v`, which starts at column -4, and `next`: -3 .. 10 are numbers 1 .. 14 of the two.
+ */
+BLUR_AVX2_INLINE __m256 blur_row_avx2(const __m256 *w, __m256 v, __m256 next)
 {
     __m256 middle = _mm256_permute2f128_ps(v, next, 0x21);
-    __m256 sum = blur_taps_avx2(w, BLUR_SHIFT_AVX2(middle, v, 1), BLUR_SHIFT_AVX2(middle, v, 2),
-                                BLUR_SHIFT_AVX2(middle, v, 3), middle, BLUR_SHIFT_AVX2(next, middle, 1),
-                                BLUR_SHIFT_AVX2(next, middle, 2), BLUR_SHIFT_AVX2(next, middle, 3));
-    if (stream)
-        _mm256_stream_ps(out, sum);
-    else
-        _mm256_store_ps(out, sum);
+    return blur_taps_avx2(w, BLUR_SHIFT_AVX2(middle, v, 1), BLUR_SHIFT_AVX2(middle, v, 2),
+                          BLUR_SHIFT_AVX2(middle, v, 3), middle, BLUR_SHIFT_AVX2(next, middle, 1),
+                          BLUR_SHIFT_AVX2(next, middle, 2), BLUR_SHIFT_AVX2(next, middle, 3));
 }
 
-/* As blur_strip. The vectors of vertical sums start four columns early: outputs 0 .. 7 of a step need -3 .. 10, which
-   are numbers 1 .. 14 of two vectors. Rows are written out one by one: loops over them would put v into memory where
-   the compiler does not unroll. */
-BLUR_AVX2_INLINE void blur_strip_avx2(const float *in, size_t stride, float *out, size_t out_stride, uint32_t columns,
-                                      const __m256 *w, bool stream)
-{
-    __m256 v[4], next[4];
-    uint32_t c;
-    blur_columns_avx2(in - 4, stride, w, v);
-    for (c = 0; c < columns; c += 8) {
-        blur_columns_avx2(in + c + 4, stride, w, next);
-        blur_row_avx2(w, v[0], next[0], out + c, stream);
-        blur_row_avx2(w, v[1], next[1], out + out_stride + c, stream);
-        blur_row_avx2(w, v[2], next[2], out + 2 * out_stride + c, stream);
-        blur_row_avx2(w, v[3], next[3], out + 3 * out_stride + c, stream);
-        v[0] = next[0];
-        v[1] = next[1];
-        v[2] = next[2];
-        v[3] = next[3];
-    }
-}
-
+/* Rows are written out one by one: a loop over them would put v into memory where the compiler does not unroll. */
 BLUR_AVX2 static inline void blur_full_avx2(const float *in, size_t stride, float *out, size_t out_stride,
                                             uint32_t width, uint32_t from, uint32_t to, const float w[4])
 {
-    __m256 weight[4];
-    uint32_t r;
+    __m256 weight[4], v[4], next[4];
+    uint32_t r, c;
     for (r = 0; r < 4; ++r)
         weight[r] = _mm256_set1_ps(w[r]);
-    for (r = from; r < to; r += BLUR_ROWS)
-        blur_strip_avx2(in + r * stride, stride, out + r * out_stride, out_stride, width, weight, true);
+    for (r = from; r < to; r += BLUR_ROWS) {
+        const float *p = in + r * stride;
+        float *o = out + r * out_stride;
+        blur_columns_avx2(p - 4, stride, weight, v);
+        for (c = 0; c < width; c += 8) {
+            blur_columns_avx2(p + c + 4, stride, weight, next);
+            _mm256_stream_ps(o + c, blur_row_avx2(weight, v[0], next[0]));
+            _mm256_stream_ps(o + out_stride + c, blur_row_avx2(weight, v[1], next[1]));
+            _mm256_stream_ps(o + 2 * out_stride + c, blur_row_avx2(weight, v[2], next[2]));
+            _mm256_stream_ps(o + 3 * out_stride + c, blur_row_avx2(weight, v[3], next[3]));
+            v[0] = next[0];
+            v[1] = next[1];
+            v[2] = next[2];
+            v[3] = next[3];
+        }
+    }
     _mm_sfence();
 }
 
-/* Stores go through the caches: blocks are small, and whoever merges the layers reads them soon. */
-BLUR_AVX2 static inline void blur_masked_avx2(const float *in, size_t stride, float *out, size_t out_stride,
-                                              const blur_run *run, size_t count, const float w[4])
+/* Fetch the four rows of a run that the block row before it has not needed. */
+static inline void blur_prefetch(const float *in, size_t stride, const blur_run *run)
 {
-    __m256 weight[4];
-    size_t i;
-    for (i = 0; i < 4; ++i)
-        weight[i] = _mm256_set1_ps(w[i]);
-    for (i = 0; i < count; ++i) {
-        size_t r = (size_t)run[i].row * BLUR_ROWS, c = (size_t)run[i].first * BLUR_COLUMNS;
-        blur_strip_avx2(in + r * stride + c, stride, out + r * out_stride + c, out_stride,
-                        (uint32_t)(run[i].end - run[i].first) * BLUR_COLUMNS, weight, false);
+    const float *p = in + ((size_t)run->row * BLUR_ROWS + 3) * stride + (size_t)run->first * BLUR_COLUMNS - 4;
+    size_t c, end = (size_t)(run->end - run->first) * BLUR_COLUMNS + 8;
+    for (c = 0; c < end; c += 16) {
+        _mm_prefetch((const char *)(p + c), _MM_HINT_T0);
+        _mm_prefetch((const char *)(p + stride + c), _MM_HINT_T0);
+        _mm_prefetch((const char *)(p + 2 * stride + c), _MM_HINT_T0);
+        _mm_prefetch((const char *)(p + 3 * stride + c), _MM_HINT_T0);
+    }
+}
+
+/* Two blocks at a time. Stores go through the caches: whoever merges the layers reads them soon. */
+BLUR_AVX2 static inline void blur_packed_avx2(const float *in, size_t stride, float *out, const blur_run *run,
+                                              size_t count, const float w[4])
+{
+    __m256 weight[4], v[4], next[4], r0, r1, r2, r3;
+    size_t k;
+    uint32_t n;
+    for (k = 0; k < 4; ++k)
+        weight[k] = _mm256_set1_ps(w[k]);
+    for (k = 0; k < count; ++k) {
+        const float *p = in + (size_t)run[k].row * BLUR_ROWS * stride + (size_t)run[k].first * BLUR_COLUMNS;
+        if (k + BLUR_AHEAD < count)
+            blur_prefetch(in, stride, &run[k + BLUR_AHEAD]);
+        blur_columns_avx2(p - 4, stride, weight, v);
+        for (n = (uint32_t)(run[k].end - run[k].first);; n -= 2, p += 8) {
+            blur_columns_avx2(p + 4, stride, weight, next);
+            r0 = blur_row_avx2(weight, v[0], next[0]);
+            r1 = blur_row_avx2(weight, v[1], next[1]);
+            r2 = blur_row_avx2(weight, v[2], next[2]);
+            r3 = blur_row_avx2(weight, v[3], next[3]);
+            _mm256_store_ps(out, _mm256_permute2f128_ps(r0, r1, 0x20));
+            _mm256_store_ps(out + 8, _mm256_permute2f128_ps(r2, r3, 0x20));
+            out += BLUR_BLOCK;
+            if (n == 1)
+                break;
+            _mm256_store_ps(out, _mm256_permute2f128_ps(r0, r1, 0x31));
+            _mm256_store_ps(out + 8, _mm256_permute2f128_ps(r2, r3, 0x31));
+            out += BLUR_BLOCK;
+            if (n == 2)
+                break;
+            v[0] = next[0];
+            v[1] = next[1];
+            v[2] = next[2];
+            v[3] = next[3];
+        }
     }
 }
 
@@ -384,43 +414,62 @@ BLUR_AVX512 static inline void blur_full_avx512(const float *in, size_t stride, 
     _mm_sfence();
 }
 
-/* As blur_row_avx2. */
-BLUR_AVX512_INLINE void blur_part_avx512(const __m512 *w, __m512 v, __m512 next, float *out, __mmask16 store)
+/* Sixteen columns from the vectors `v`, which starts at column -4, and `next`. */
+BLUR_AVX512_INLINE __m512 blur_shifted_avx512(const __m512 *w, __m512 v, __m512 next)
 {
-    __m512 sum =
-        blur_taps_avx512(w, BLUR_SHIFT_AVX512(next, v, 1), BLUR_SHIFT_AVX512(next, v, 2), BLUR_SHIFT_AVX512(next, v, 3),
-                         BLUR_SHIFT_AVX512(next, v, 4), BLUR_SHIFT_AVX512(next, v, 5), BLUR_SHIFT_AVX512(next, v, 6),
-                         BLUR_SHIFT_AVX512(next, v, 7));
-    _mm512_mask_storeu_ps(out, store, sum);
+    return blur_taps_avx512(w, BLUR_SHIFT_AVX512(next, v, 1), BLUR_SHIFT_AVX512(next, v, 2),
+                            BLUR_SHIFT_AVX512(next, v, 3), BLUR_SHIFT_AVX512(next, v, 4), BLUR_SHIFT_AVX512(next, v, 5),
+                            BLUR_SHIFT_AVX512(next, v, 6), BLUR_SHIFT_AVX512(next, v, 7));
 }
 
-/* Vectors start four columns early as in blur_strip_avx2; the last step of an odd run writes half a vector. */
-BLUR_AVX512 static inline void blur_masked_avx512(const float *in, size_t stride, float *out, size_t out_stride,
-                                                  const blur_run *run, size_t count, const float w[4])
+/* Four blocks at a time; the last one or two need columns -3 .. 10 at most, which are in v: the usual run, along the
+   border of two leaves, takes one vector of columns only. */
+BLUR_AVX512 static inline void blur_packed_avx512(const float *in, size_t stride, float *out, const blur_run *run,
+                                                  size_t count, const float w[4])
 {
-    __m512 weight[4];
+    __m512 weight[4], v[4], next[4], r0, r1, r2, r3, low01, low23, high01, high23;
     size_t k;
+    uint32_t n;
     for (k = 0; k < 4; ++k)
         weight[k] = _mm512_set1_ps(w[k]);
     for (k = 0; k < count; ++k) {
-        size_t r = (size_t)run[k].row * BLUR_ROWS, c = (size_t)run[k].first * BLUR_COLUMNS;
-        size_t end = (size_t)run[k].end * BLUR_COLUMNS;
-        const float *p = in + r * stride;
-        float *o = out + r * out_stride;
-        __m512 v[4], next[4];
-        blur_columns_avx512(p + c - 4, stride, weight, v);
-        for (; c < end; c += 16) {
-            __mmask16 store = end - c < 16 ? 0xff : 0xffff;
-            blur_columns_avx512(p + c + 12, stride, weight, next);
-            blur_part_avx512(weight, v[0], next[0], o + c, store);
-            blur_part_avx512(weight, v[1], next[1], o + out_stride + c, store);
-            blur_part_avx512(weight, v[2], next[2], o + 2 * out_stride + c, store);
-            blur_part_avx512(weight, v[3], next[3], o + 3 * out_stride + c, store);
+        const float *p = in + (size_t)run[k].row * BLUR_ROWS * stride + (size_t)run[k].first * BLUR_COLUMNS;
+        if (k + BLUR_AHEAD < count)
+            blur_prefetch(in, stride, &run[k + BLUR_AHEAD]);
+        blur_columns_avx512(p - 4, stride, weight, v);
+        for (n = (uint32_t)(run[k].end - run[k].first); n > 2; n = n > 4 ? n - 4 : 0, p += 16) {
+            blur_columns_avx512(p + 12, stride, weight, next);
+            r0 = blur_shifted_avx512(weight, v[0], next[0]);
+            r1 = blur_shifted_avx512(weight, v[1], next[1]);
+            r2 = blur_shifted_avx512(weight, v[2], next[2]);
+            r3 = blur_shifted_avx512(weight, v[3], next[3]);
+            low01 = _mm512_shuffle_f32x4(r0, r1, 0x44);
+            low23 = _mm512_shuffle_f32x4(r2, r3, 0x44);
+            high01 = _mm512_shuffle_f32x4(r0, r1, 0xee);
+            high23 = _mm512_shuffle_f32x4(r2, r3, 0xee);
+            _mm512_store_ps(out, _mm512_shuffle_f32x4(low01, low23, 0x88));
+            _mm512_store_ps(out + BLUR_BLOCK, _mm512_shuffle_f32x4(low01, low23, 0xdd));
+            _mm512_store_ps(out + 2 * BLUR_BLOCK, _mm512_shuffle_f32x4(high01, high23, 0x88));
+            if (n > 3)
+                _mm512_store_ps(out + 3 * BLUR_BLOCK, _mm512_shuffle_f32x4(high01, high23, 0xdd));
+            out += (n > 3 ? 4 : 3) * BLUR_BLOCK;
             v[0] = next[0];
             v[1] = next[1];
             v[2] = next[2];
             v[3] = next[3];
         }
+        if (!n)
+            continue;
+        r0 = blur_shifted_avx512(weight, v[0], v[0]);
+        r1 = blur_shifted_avx512(weight, v[1], v[1]);
+        r2 = blur_shifted_avx512(weight, v[2], v[2]);
+        r3 = blur_shifted_avx512(weight, v[3], v[3]);
+        low01 = _mm512_shuffle_f32x4(r0, r1, 0x44);
+        low23 = _mm512_shuffle_f32x4(r2, r3, 0x44);
+        _mm512_store_ps(out, _mm512_shuffle_f32x4(low01, low23, 0x88));
+        if (n > 1)
+            _mm512_store_ps(out + BLUR_BLOCK, _mm512_shuffle_f32x4(low01, low23, 0xdd));
+        out += n * BLUR_BLOCK;
     }
 }
 #endif
