@@ -3,8 +3,8 @@
 
      out[r][c] = sum over i, j = -3 .. 3 of w[|i|] w[|j|] in[r + i][c + j],  w[0] + 2 (w[1] + w[2] + w[3]) = 1
 
-   >= 0 in, >= 0 out; a NaN or infinity spreads over its window and no further. Relative error of a sum of masses
-   <= 14 roundings = 8.4e-7 (all terms are positive), as long as no product of two weights and a mass underflows.
+   >= 0 in, >= 0 out; a NaN or infinity spreads over its window and no further. Relative error 3e-7 (bench_denoise; all
+   terms are positive), as long as no product of two weights and a mass underflows.
 
    THE MATRIX in: element (0, 0) 64-byte aligned, `stride` floats from row to row, a multiple of 16. Rows -3 ..
    width + 2 and columns -16 .. width + 15 exist, and 16 floats more (see blur_floats); blur_pad fills what is outside
