@@ -14,15 +14,13 @@
 #include <string>
 #include <vector>
 
-#include <openpgl/cpp/OpenPGL.h>
+#include "openpgl_common.h"
 
 #include "embree.h"
 extern "C" {
 #include "tracer.h"
 extern const tr_method tr_method_openpgl;
 }
-
-namespace pgl = openpgl::cpp;
 
 namespace
 {
@@ -112,30 +110,6 @@ struct parser {
 
 /* ---- life */
 
-/* The widest vectors that both this processor and the library have. */
-PGL_DEVICE_TYPE device_type(size_t threads)
-{
-    std::vector<PGL_DEVICE_TYPE> types;
-#if defined(__x86_64__) || defined(__i386__)
-#ifdef OPENPGL_SUPPORT_DEVICE_TYPE_CPU_16
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw") &&
-        __builtin_cpu_supports("avx512vl"))
-        types.push_back(PGL_DEVICE_TYPE_CPU_16);
-#endif
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
-        types.push_back(PGL_DEVICE_TYPE_CPU_8);
-#else
-    types.push_back(PGL_DEVICE_TYPE_CPU_8);
-#endif
-    types.push_back(PGL_DEVICE_TYPE_CPU_4);
-    for (PGL_DEVICE_TYPE type : types) /* the classes do not tell whether there is such a device: the functions do */
-        if (PGLDevice device = pglNewDevice(type, threads)) {
-            pglReleaseDevice(device);
-            return type;
-        }
-    return PGL_DEVICE_TYPE_NONE;
-}
-
 bool configure(method *m, tr_method_env *env, char *err, size_t err_size)
 {
     static const PGL_DIRECTIONAL_DISTRIBUTION_TYPE types[] = {PGL_DIRECTIONAL_DISTRIBUTION_PARALLAX_AWARE_VMM,
@@ -153,7 +127,7 @@ bool configure(method *m, tr_method_env *env, char *err, size_t err_size)
         return false;
     }
     size_t threads = (size_t)(env->threads > 0 ? env->threads : 1);
-    PGL_DEVICE_TYPE device = device_type(threads);
+    PGL_DEVICE_TYPE device = openpgl_device_type(threads);
     if (device == PGL_DEVICE_TYPE_NONE) {
         snprintf(err, err_size, "openpgl: the library has no code for this processor");
         return false;
@@ -318,25 +292,6 @@ void describe(void *, int n, const void *handles, float *cell, float *depth)
     }
 }
 
-/* The number in the column `name` of a table with one row, 0 where there is none. */
-double column(const std::string &header, const std::string &row, const std::string &name)
-{
-    size_t h = 0, r = 0;
-    while (h < header.size() && r < row.size()) {
-        size_t h_end = header.find(',', h), r_end = row.find(',', r);
-        std::string title = header.substr(h, h_end - h);
-        title.erase(0, title.find_first_not_of(' '));
-        title.erase(title.find_last_not_of(' ') + 1); /* npos + 1 is 0 */
-        if (title == name)
-            return strtod(row.c_str() + r, nullptr);
-        if (h_end == std::string::npos || r_end == std::string::npos)
-            break;
-        h = h_end + 1;
-        r = r_end + 1;
-    }
-    return 0;
-}
-
 void stats(void *data, tr_method_stats *out)
 {
     method *m = static_cast<method *>(data);
@@ -344,19 +299,14 @@ void stats(void *data, tr_method_stats *out)
     out->samples = m->samples + m->zeros;
     out->refused = m->refused;
     out->extra_bytes = (double)m->stored_peak;
-    double components = 0, nodes = 0;
-    if (m->updates) {
-        pgl::FieldStatistics s = m->field->GetSurfaceStatistics();
-        std::string header = s.HeaderCSVString(), row = s.ToCSVString();
-        out->cells = (uint64_t)column(header, row, "numCacheRegions");
-        nodes = column(header, row, "numberOfNodes");
-        out->bytes = out->cells * (uint64_t)column(header, row, "sizePerCacheRegions(bs)") +
-                     (uint64_t)column(header, row, "sizeAllNodesUsed");
-        components = column(header, row, "averageNumberOfComponents");
-    }
+    openpgl_size size;
+    if (m->updates)
+        size = openpgl_measure(*m->field);
+    out->cells = size.cells;
+    out->bytes = size.bytes;
     snprintf(out->json, sizeof out->json,
              "\"updates\": %u, \"zeros\": %llu, \"nodes\": %.0f, \"mean_components\": %.3f", m->updates,
-             (unsigned long long)m->zeros, nodes, components);
+             (unsigned long long)m->zeros, size.nodes, size.components);
 }
 
 tr_method describe_method()
