@@ -90,7 +90,7 @@ BENCH_MAINS := make_reference
 BENCH_TOOLS := $(patsubst bench/%.c,$(B)/%,$(wildcard $(BENCH_MAINS:%=bench/%.c)))
 # TESTS="a b" picks test_a and test_b, and "matrix", "rig", "cli"; empty = all.
 TEST_PROGRAMS := $(if $(TESTS),$(filter $(TESTS:%=$(B)/tests/test_%),$(TESTS_ALL)),$(TESTS_ALL))
-SOURCES := $(sort $(HEADERS) $(wildcard examples/*.c examples/tracer/*.[ch] examples/tracer/*.cpp tests/*.[ch] tests/*/*.[ch] bench/*.[ch]))
+SOURCES := $(sort $(HEADERS) $(wildcard examples/*.c examples/tracer/*.[ch] examples/tracer/*.cpp tests/*.[ch] tests/*/*.[ch] bench/*.[ch] bench/*.cpp))
 SCRIPTS := .ci/run $(wildcard tests/*.sh examples/*.sh bench/*.sh)
 
 .PHONY: all programs deps check-deps demo test stress run-demo run-test run-stress expected-count bench run-bench bench-readme bench-error run-bench-error format lint clean help
@@ -138,6 +138,11 @@ $(B)/obj/%.o: %.c $(B)/flags
 	$(Q)mkdir -p $(@D)
 	$(Q)$(CC) $(CFLAGS_ALL) $(CPPFLAGS_ALL) -MMD -MP -c $< -o $@
 
+$(B)/obj/%.o: %.cpp $(B)/flags
+	$(SAY) CXX $<
+	$(Q)mkdir -p $(@D)
+	$(Q)$(CXX) $(CXXFLAGS_ALL) $(CPPFLAGS_ALL) -MMD -MP -c $< -o $@
+
 $(B)/libtracer.a: $(TRACER_OBJ)
 	$(SAY) AR $@
 	$(Q)rm -f $@
@@ -160,6 +165,8 @@ $(TESTS_ALL): $(B)/tests/%: $(B)/obj/tests/%.o $(B)/libtracer.a
 $(STRESSES): $(B)/tests/%: $(B)/obj/tests/%.o
 	$(SAY) LD $@
 	$(LINK) -lm -lpthread -o $@
+
+$(B)/bench_field: $(if $(OPENPGL_DIR),$(B)/obj/bench/field_openpgl.o)
 
 $(BENCHES) $(BENCH_TOOLS): $(B)/%: $(B)/obj/bench/%.o $(B)/libtracer.a
 	$(SAY) LD $@

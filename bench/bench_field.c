@@ -9,13 +9,15 @@
 #define GSD_IMPLEMENTATION
 #include "field_sdtree.h"
 #include "field_none.h"
+#include "field_openpgl.h"
 #include "plot.h"
 
 #include <limits.h>
 #include <stdarg.h>
 
-static const field_method *const all_methods[] = {&field_none_method, &field_sdtree_method,
-                                                  &field_sdtree_switching_method};
+static const field_method *const all_methods[] = {
+    &field_none_method,    &field_sdtree_method,       &field_sdtree_switching_method,
+    &field_openpgl_method, &field_openpgl_4000_method, &field_openpgl_quadtree_method};
 #define METHODS ((int)(sizeof all_methods / sizeof *all_methods))
 #define MAX_FIELDS 32
 #define MAX_SIZES 24
@@ -114,19 +116,35 @@ static void add_outcome(outcome *mean, const outcome *one, int seed, int seeds)
     mean->query_ns = seed && mean->query_ns < one->query_ns ? mean->query_ns : one->query_ns;
 }
 
+static bool bytes_told(const outcome *o) { return o->bytes > 0 || o->cells <= 0; }
+
 static void json_row(const field_method *m, const char *field, int log2_samples, double extent, const outcome *o)
 {
     if (!json_file)
         return;
-    fprintf(json_file, "%s\n  {\"method\": \"%s\", \"field\": \"", json_rows++ ? "," : "[", m->name);
+    fprintf(json_file, "%s\n  {\"method\": \"%s\", \"field\": \"", json_rows++ ? "," : "", m->name);
     for (const char *c = field; *c; ++c)
         if ((unsigned char)*c >= ' ')
             fprintf(json_file, *c == '"' || *c == '\\' ? "\\%c" : "%c", *c);
     fprintf(json_file, "\", \"log2_samples\": %d, \"extent\": %g, ", log2_samples, extent);
     if (o->score.a > 0)
         fprintf(json_file, "\"a\": %.6g, \"c\": %.6g, ", o->score.a, o->score.c);
-    fprintf(json_file, "\"ns_per_sample\": %.2f, \"ns_per_query\": %.2f, \"cells\": %.0f, \"bytes\": %.0f}",
-            o->record_ns, o->query_ns, o->cells, o->bytes);
+    fprintf(json_file, "\"ns_per_sample\": %.2f, \"ns_per_query\": %.2f, \"cells\": %.0f", o->record_ns, o->query_ns,
+            o->cells);
+    if (bytes_told(o))
+        fprintf(json_file, ", \"bytes\": %.0f", o->bytes);
+    fputc('}', json_file);
+}
+
+/* Says so where a method is not. */
+static bool built(const field_method *m)
+{
+    if (m->create)
+        return true;
+    printf("%-18s not built: make OPENPGL_DIR=/path/to/installation\n", m->name);
+    if (json_file)
+        fprintf(json_file, "%s\n  {\"method\": \"%s\", \"built\": false}", json_rows++ ? "," : "", m->name);
+    return false;
 }
 
 /* ---- scores ------------------------------------------------------------------------------------------------- */
@@ -141,15 +159,19 @@ static void run_scores(const options *o)
         printf("%-18s %8s %8s %8s %10s %10s %8s %10s\n", "method", "samples", "A", "C", "ns/sample", "ns/query",
                "cells", "bytes");
         for (int i = 0; i < o->method_count; ++i)
-            for (int k = 0; k < o->size_count; ++k) {
+            for (int k = 0; built(o->methods[i]) && k < o->size_count; ++k) {
                 outcome mean = {{0, 0}, 0, 0, 0, 0};
                 for (int seed = 0; seed < o->seeds; ++seed) {
                     field_setup setup = {o->methods[i], &field->field, 1, 1000 + (uint64_t)seed, o->sizes[k], o->exact};
                     outcome one = measure(&setup, SF1_POINTS, SF1_DIRECTIONS);
                     add_outcome(&mean, &one, seed, o->seeds);
                 }
-                printf("%-18s     2^%-2d %8.3f %8.3f %10.1f %10.1f %8.0f %10.0f\n", o->methods[i]->name, o->sizes[k],
-                       mean.score.a, mean.score.c, mean.record_ns, mean.query_ns, mean.cells, mean.bytes);
+                printf("%-18s     2^%-2d %8.3f %8.3f %10.1f %10.1f %8.0f ", o->methods[i]->name, o->sizes[k],
+                       mean.score.a, mean.score.c, mean.record_ns, mean.query_ns, mean.cells);
+                if (bytes_told(&mean))
+                    printf("%10.0f\n", mean.bytes);
+                else
+                    printf("%10s\n", "not told");
                 fflush(stdout);
                 json_row(o->methods[i], field->name, o->sizes[k], 1, &mean);
             }
@@ -380,6 +402,8 @@ static bool run_growth(const options *o)
     if (o->plot)
         plot_all(o, g); /* empty: an unwritable directory is told before the measurements */
     for (int i = 0; i < o->method_count; ++i) {
+        if (!built(o->methods[i]))
+            continue;
         bool samples = grow_samples(o, o->methods[i], &g[i]), extent = grow_extent(o, o->methods[i], &g[i]);
         ok = ok && samples && extent;
     }
@@ -523,7 +547,7 @@ static void parse(int argc, char **argv, options *o)
 
 static void close_json(const options *o)
 {
-    bool ok = fputs(json_rows ? "\n]\n" : "[]\n", json_file) >= 0 && !ferror(json_file);
+    bool ok = fputs("\n]}\n", json_file) >= 0 && !ferror(json_file);
     if (fclose(json_file) || !ok)
         fail("%s: cannot be written", o->json);
 }
@@ -540,7 +564,7 @@ int main(int argc, char **argv)
     parse(argc, argv, &o);
     if (o.json && !(json_file = fopen(o.json, "w")))
         fail("%s: cannot be written: %s", o.json, strerror(errno));
-    bench_print_machine(NULL);
+    bench_print_machine(json_file);
     if (o.growth)
         ok = run_growth(&o);
     else

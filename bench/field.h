@@ -1,6 +1,5 @@
-/* field.h: a guiding method behind function pointers, learning a known radiance field; fields read from files.
+/* field.h: a guiding method (field_method.h) learning a known radiance field; fields read from files.
 
-     >>method   what bench_field asks of a method (field_sdtree.h is an example)
      >>learn    draw samples of a field, record, update; time of a query
      >>check    that density and samples of a method belong together
      >>file     one source per line: centre x y z radius r strength s [visible a b c d] */
@@ -8,34 +7,10 @@
 #define FIELD_H
 
 #include "bench.h"
-#include "sf1.h"
+#include "field_method.h"
 
 #include <errno.h>
 #include <stdbool.h>
-
-/* ---- >>method ----------------------------------------------------------------------------------------------- */
-
-/* Where a direction is asked for. The cube is [0, extent]^3; normal NULL = directions of the whole sphere, else the
-   method may multiply the surface's cosine in. */
-typedef struct field_place {
-    const float *position, *normal;
-} field_place;
-
-/* Functions that return text return NULL where all went well, else what went wrong. */
-typedef struct field_method {
-    const char *name, *what;
-    void *(*create)(double extent); /* NULL = out of memory */
-    /* Samples of the running update; guide[i] = the method's own density at samples[i], 0 = not guided there. */
-    const char *(*record)(void *state, const sf1_sample *samples, const float *guide, uint32_t count);
-    const char *(*update)(void *state); /* learn from what was recorded; queries see it from here on */
-    /* Find, then sample with u (in [0, 1)^2) and the density of a given direction; returns the sample's density. */
-    double (*query)(void *state, field_place place, const float u[2], const float given[3], float sampled[3],
-                    double *given_pdf);
-    double (*pdf)(void *state, field_place place, const float direction[3]); /* find, then the density, 1/sr */
-    uint64_t (*bytes)(void *state); /* all that it needs between updates, without buffers of samples */
-    uint32_t (*cells)(void *state);
-    void (*destroy)(void *state);
-} field_method;
 
 /* ---- >>learn ------------------------------------------------------------------------------------------------ */
 

@@ -1,6 +1,7 @@
 #!/bin/sh
 # readme.sh README.md JSON...: put the rows of microbenchmarks between the README's lines <!-- NAME.json --> and
-# <!-- end -->, as a table. Rows without a goal are left out: the benchmark prints them.
+# <!-- end -->, as a table. Rows of kernels without a goal are left out, as are fields other than sf1: the benchmarks
+# print them.
 readme=$1
 shift
 for json in "$@"; do
@@ -13,7 +14,7 @@ for json in "$@"; do
             rest = substr(line, at + length(key) + 4)
             if (!at) return ""
             if (substr(rest, 1, 1) == "\"") { rest = substr(rest, 2); return substr(rest, 1, index(rest, "\"") - 1) }
-            match(rest, /^[-+0-9.e]+/)
+            match(rest, /^[-+0-9.a-z]+/)
             return substr(rest, 1, RLENGTH)
         }
         FNR == NR {
@@ -21,6 +22,17 @@ for json in "$@"; do
                 machine = value($0, "cpu") ", " value($0, "compiler") ", commit " value($0, "commit") "; FMA " \
                     value($0, "fma_gflops") " GFLOP/s, copy of 2048² floats " value($0, "copy_ms") " ms, memory read " \
                     value($0, "read_gb_s") " GB/s"
+            } else if (value($0, "built") == "false" || value($0, "field") == "sf1") {
+                method = value($0, "method")
+                size = value($0, "log2_samples")
+                if (!(method in scores)) { order[++methods] = method; scores[method] = "" }
+                if (size == "") { scores[method] = " not built |"; next }
+                if (!(size in seen)) { seen[size] = 1; sizes = sizes sprintf(" A; C, 2^%d |", size) }
+                scores[method] = scores[method] sprintf(" %.2f; %.2f |", value($0, "a"), value($0, "c"))
+                bytes = value($0, "bytes")
+                costs[method] = sprintf(" %.0f | %.0f | %d | %s |", value($0, "ns_per_sample"),
+                    value($0, "ns_per_query"), value($0, "cells"),
+                    bytes == "" ? "not told" : bytes + 0 > 0 ? sprintf("%.0f", bytes / 1024) : "-")
             } else if (value($0, "target_ns") + 0 > 0) {
                 ns = value($0, "ns")
                 goal = value($0, "target_ns")
@@ -32,6 +44,14 @@ for json in "$@"; do
         }
         $0 == "<!-- " name " -->" {
             print
+            if (methods) {
+                printf "\n%s.\n\n| method |%s ns/sample | ns/query | cells | KiB |\n|---|", machine, sizes
+                for (i = gsub(/\|/, "|", sizes) + 4; i > 0; --i) printf "---|"
+                for (i = 1; i <= methods; ++i) printf "\n| `%s` |%s%s", order[i], scores[order[i]], costs[order[i]]
+                printf "\n\n"
+                skip = 1
+                next
+            }
             printf "\n%s.\n\n| kernel | min ns | median | spread | faster than naive | over the limit | goal |\n", machine
             printf "|---|---|---|---|---|---|---|\n%s\n", rows
             skip = 1

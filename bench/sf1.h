@@ -124,7 +124,7 @@ static inline double sf1_radiance(const sf1_point *p, const double *w, double *d
 static inline void sf1_frame(const double *n, double *s, double *t)
 {
     int a = fabs(n[0]) < 0.6 ? 0 : 1;
-    double e[3] = {a == 0, a == 1, 0}, d = sf1_dot(e, n), l;
+    double e[3] = {a ? 0. : 1., a ? 1. : 0., 0}, d = sf1_dot(e, n), l;
     for (int i = 0; i < 3; ++i)
         s[i] = e[i] - d * n[i];
     l = sqrt(sf1_dot(s, s));

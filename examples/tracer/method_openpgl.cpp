@@ -3,7 +3,11 @@
 
    Options (--set key=value), defaults as in Open PGL: distribution=pavmm|vmm|quadtree (pavmm: parallax-aware mixture),
    leaf_size (samples of a cell before it splits, 32000), knn=on|off (stochastic lookup among near cells),
-   deterministic=on|off, product=on|off (with the cosine, mixtures only), alpha (probability of bsdf sampling, 0.5). */
+   deterministic=on|off, product=on|off (with the cosine, mixtures only), alpha (probability of bsdf sampling, 0.5).
+
+   Guided Russian roulette asks for the radiance that a surface reflects. Open PGL tells that only where it was built
+   with radiance caches, which it is not by default: the adapter keeps a grid of its own. */
+#include <algorithm>
 #include <atomic>
 #include <cmath>
 #include <cstdlib>
@@ -14,15 +18,13 @@
 #include <string>
 #include <vector>
 
-#include <openpgl/cpp/OpenPGL.h>
+#include "openpgl_common.h"
 
 #include "embree.h"
 extern "C" {
 #include "tracer.h"
 extern const tr_method tr_method_openpgl;
 }
-
-namespace pgl = openpgl::cpp;
 
 namespace
 {
@@ -38,12 +40,107 @@ const size_t most_samples = (size_t)1 << 22;
    slot, for it is large and slow to allocate, and the method frees it. */
 struct slot {
     pgl::SurfaceSamplingDistribution *distribution;
+    float reflected;
+};
+
+/* Mean of the radiance that surfaces reflect, in boxes of a grid over the scene, and in larger boxes where a box has
+   met too few paths. Workers write one list a tile; the lists are added up in the order of tiles, so that sums do not
+   depend on threads.
+
+   Where light is rare, the mean of a few paths is mostly too low, and roulette then ends paths that matter. On ajar (20
+   s, cells of 4,000 samples) relMSE is 0.91 with 128 boxes an axis and 32 paths, 0.42 with 64 and 32, 0.39 with 64 and
+   1,000 or 4,000. */
+struct reflected_grid {
+    static const int levels = 4, finest = 64; /* boxes along an axis: 64, 32, 16, 8 */
+    static const uint32_t enough = 1000;      /* paths for a mean to count */
+
+    struct entry {
+        uint32_t box; /* of the finest grid */
+        float value;
+    };
+    struct total {
+        double sum;
+        uint64_t count;
+    };
+
+    vec3 low, scale;
+    std::vector<std::vector<entry>> lists; /* one a tile */
+    std::vector<total> totals;             /* of the finest grid, over all passes */
+    std::vector<float> mean;               /* what queries read; 0 = not known */
+
+    reflected_grid(const tr_scene *scene, int tiles)
+        : low(scene->bounds_min), lists((size_t)tiles), totals((size_t)finest * finest * finest), mean(totals.size())
+    {
+        vec3 size = sub3(scene->bounds_max, low);
+        scale = v3(per(size.x), per(size.y), per(size.z));
+    }
+
+    static float per(float size) { return size > 0 ? (float)finest / size : 0; }
+    static uint32_t along(float at) { return at > 0 ? at < (float)finest ? (uint32_t)at : finest - 1 : 0; }
+
+    uint32_t box_of(vec3 p) const
+    {
+        vec3 at = mul3(sub3(p, low), scale);
+        return (along(at.z) * finest + along(at.y)) * finest + along(at.x);
+    }
+
+    void add(int tile, const tr_vertex *v)
+    {
+        float value = mean3(mul3(v->f, v->L)) * v->cosine / v->pdf_mix;
+        if (std::isfinite(value) && value >= 0)
+            lists[(size_t)tile].push_back({box_of(v->p), value});
+    }
+
+    void sum_up()
+    {
+        for (std::vector<entry> &list : lists) {
+            for (const entry &e : list) {
+                totals[e.box].sum += (double)e.value;
+                totals[e.box].count++;
+            }
+            list.clear();
+        }
+    }
+
+    /* Means of the smallest boxes that have met enough paths. */
+    void publish()
+    {
+        std::vector<total> grid = totals;
+        std::fill(mean.begin(), mean.end(), 0.0f);
+        for (int level = 0; level < levels; ++level) {
+            size_t side = (size_t)(finest >> level);
+            for (size_t i = 0; i < mean.size(); ++i) {
+                const total &t = grid[box_at(i, level)];
+                if (mean[i] <= 0 && t.count >= enough)
+                    mean[i] = (float)(t.sum / (double)t.count);
+            }
+            std::vector<total> coarser(side * side * side / 8);
+            for (size_t i = 0; i < grid.size(); ++i) {
+                size_t x = i % side, y = i / side % side, z = i / side / side;
+                total &t = coarser[(z / 2 * (side / 2) + y / 2) * (side / 2) + x / 2];
+                t.sum += grid[i].sum;
+                t.count += grid[i].count;
+            }
+            grid.swap(coarser);
+        }
+    }
+
+    /* Where box i of the finest grid lies in a coarser one. */
+    static size_t box_at(size_t i, int level)
+    {
+        size_t side = (size_t)(finest >> level);
+        size_t x = i % finest >> level, y = i / finest % finest >> level, z = i / finest / finest >> level;
+        return (z * side + y) * side + x;
+    }
+
+    size_t bytes() const { return totals.size() * sizeof(total) + mean.size() * sizeof(float); }
 };
 
 struct method {
     std::unique_ptr<pgl::Device> device;
     std::unique_ptr<pgl::Field> field;
     std::unique_ptr<pgl::SampleStorage> storage; /* takes samples from several threads */
+    std::unique_ptr<reflected_grid> reflected;
     std::vector<std::unique_ptr<pgl::SurfaceSamplingDistribution>> pool;
     std::mutex pool_lock;
     std::atomic<uint64_t> refused{0}; /* directions not traced, or samples not finite */
@@ -112,30 +209,6 @@ struct parser {
 
 /* ---- life */
 
-/* The widest vectors that both this processor and the library have. */
-PGL_DEVICE_TYPE device_type(size_t threads)
-{
-    std::vector<PGL_DEVICE_TYPE> types;
-#if defined(__x86_64__) || defined(__i386__)
-#ifdef OPENPGL_SUPPORT_DEVICE_TYPE_CPU_16
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw") &&
-        __builtin_cpu_supports("avx512vl"))
-        types.push_back(PGL_DEVICE_TYPE_CPU_16);
-#endif
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
-        types.push_back(PGL_DEVICE_TYPE_CPU_8);
-#else
-    types.push_back(PGL_DEVICE_TYPE_CPU_8);
-#endif
-    types.push_back(PGL_DEVICE_TYPE_CPU_4);
-    for (PGL_DEVICE_TYPE type : types) /* the classes do not tell whether there is such a device: the functions do */
-        if (PGLDevice device = pglNewDevice(type, threads)) {
-            pglReleaseDevice(device);
-            return type;
-        }
-    return PGL_DEVICE_TYPE_NONE;
-}
-
 bool configure(method *m, tr_method_env *env, char *err, size_t err_size)
 {
     static const PGL_DIRECTIONAL_DISTRIBUTION_TYPE types[] = {PGL_DIRECTIONAL_DISTRIBUTION_PARALLAX_AWARE_VMM,
@@ -153,7 +226,7 @@ bool configure(method *m, tr_method_env *env, char *err, size_t err_size)
         return false;
     }
     size_t threads = (size_t)(env->threads > 0 ? env->threads : 1);
-    PGL_DEVICE_TYPE device = device_type(threads);
+    PGL_DEVICE_TYPE device = openpgl_device_type(threads);
     if (device == PGL_DEVICE_TYPE_NONE) {
         snprintf(err, err_size, "openpgl: the library has no code for this processor");
         return false;
@@ -164,6 +237,7 @@ bool configure(method *m, tr_method_env *env, char *err, size_t err_size)
     config.SetUseKnnLookup(knn);
     m->field.reset(new pgl::Field(m->device.get(), config));
     m->storage.reset(new pgl::SampleStorage);
+    m->reflected.reset(new reflected_grid(env->scene, env->tiles));
     m->field->SetSceneBounds({vector(env->scene->bounds_min), vector(env->scene->bounds_max)});
     return true;
 }
@@ -190,14 +264,15 @@ bool begin_pass(void *, const tr_pass *pass) { return !pass->last; }
 
 /* A traced direction is a sample; one that brought no light is counted apart, as Open PGL has it. Directions that were
    refused before tracing say nothing about the light there. */
-bool record(void *data, int, const tr_vertex *vertices, int n)
-{
+bool record(void *data, int tile, const tr_vertex *vertices, int n)
+try {
     method *m = static_cast<method *>(data);
     pgl::SampleData samples[64];
     size_t count = 0;
     uint64_t refused = 0;
     for (int i = 0; i < n; ++i) {
         const tr_vertex *v = &vertices[i];
+        m->reflected->add(tile, v);
         float L = mean3(v->L), pdf = v->pdf_mix > min_pdf ? v->pdf_mix : min_pdf;
         float distance = v->distance < far_away ? v->distance : far_away;
         if ((v->flags & TR_VERTEX_REJECTED) || !std::isfinite(L / pdf) || !(L >= 0) || !(distance > 0)) {
@@ -223,10 +298,14 @@ bool record(void *data, int, const tr_vertex *vertices, int n)
     }
     m->refused += refused;
     return true;
+} catch (const std::bad_alloc &) {
+    return false;
 }
 
 void learn(method *m)
 {
+    m->reflected->sum_up();
+    m->reflected->publish();
     size_t samples = m->storage->GetSizeSurface(), zeros = m->storage->GetSizeZeroValueSurface();
     size_t bytes = samples * sizeof(pgl::SampleData) + zeros * sizeof(pgl::ZeroValueSampleData);
     if (samples == 0) /* nothing has been lit yet */
@@ -242,15 +321,18 @@ void learn(method *m)
 void flush(void *data)
 {
     method *m = static_cast<method *>(data);
+    m->reflected->sum_up();
     if (m->storage->GetSizeSurface() + m->storage->GetSizeZeroValueSurface() >= most_samples)
         learn(m);
 }
 
 bool end_pass(void *data, const tr_pass *pass)
-{
+try {
     if (!pass->last)
         learn(static_cast<method *>(data));
     return true;
+} catch (const std::bad_alloc &) {
+    return false;
 }
 
 /* ---- queries: from several threads, while nothing learns */
@@ -282,8 +364,16 @@ void find(void *data, const tr_lookup *lookup, void *handles, float *alpha)
         bool found = d && d->Init(m->field.get(), vector(lookup->p[i]), u);
         if (found && m->product && !m->quadtree && !black3(lookup->side[i]))
             d->ApplyCosineProduct(vector(lookup->side[i]));
+        slots[i].reflected = m->reflected->mean[m->reflected->box_of(lookup->p[i])];
         alpha[i] = found ? m->alpha : 1;
     }
+}
+
+void reflected(void *, int n, const void *handles, float *radiance)
+{
+    const slot *slots = static_cast<const slot *>(handles);
+    for (int i = 0; i < n; ++i)
+        radiance[i] = slots[i].reflected;
 }
 
 float usable(float pdf) { return pdf > 0 && std::isfinite(pdf) ? pdf : 0; }
@@ -318,45 +408,21 @@ void describe(void *, int n, const void *handles, float *cell, float *depth)
     }
 }
 
-/* The number in the column `name` of a table with one row, 0 where there is none. */
-double column(const std::string &header, const std::string &row, const std::string &name)
-{
-    size_t h = 0, r = 0;
-    while (h < header.size() && r < row.size()) {
-        size_t h_end = header.find(',', h), r_end = row.find(',', r);
-        std::string title = header.substr(h, h_end - h);
-        title.erase(0, title.find_first_not_of(' '));
-        title.erase(title.find_last_not_of(' ') + 1); /* npos + 1 is 0 */
-        if (title == name)
-            return strtod(row.c_str() + r, nullptr);
-        if (h_end == std::string::npos || r_end == std::string::npos)
-            break;
-        h = h_end + 1;
-        r = r_end + 1;
-    }
-    return 0;
-}
-
 void stats(void *data, tr_method_stats *out)
 {
     method *m = static_cast<method *>(data);
     memset(out, 0, sizeof *out);
     out->samples = m->samples + m->zeros;
     out->refused = m->refused;
-    out->extra_bytes = (double)m->stored_peak;
-    double components = 0, nodes = 0;
-    if (m->updates) {
-        pgl::FieldStatistics s = m->field->GetSurfaceStatistics();
-        std::string header = s.HeaderCSVString(), row = s.ToCSVString();
-        out->cells = (uint64_t)column(header, row, "numCacheRegions");
-        nodes = column(header, row, "numberOfNodes");
-        out->bytes = out->cells * (uint64_t)column(header, row, "sizePerCacheRegions(bs)") +
-                     (uint64_t)column(header, row, "sizeAllNodesUsed");
-        components = column(header, row, "averageNumberOfComponents");
-    }
+    out->extra_bytes = (double)(m->stored_peak + m->reflected->bytes());
+    openpgl_size size;
+    if (m->updates)
+        size = openpgl_measure(*m->field);
+    out->cells = size.cells;
+    out->bytes = size.bytes;
     snprintf(out->json, sizeof out->json,
              "\"updates\": %u, \"zeros\": %llu, \"nodes\": %.0f, \"mean_components\": %.3f", m->updates,
-             (unsigned long long)m->zeros, nodes, components);
+             (unsigned long long)m->zeros, size.nodes, size.components);
 }
 
 tr_method describe_method()
@@ -373,6 +439,8 @@ tr_method describe_method()
     t.find = find;
     t.sample = sample;
     t.pdf = pdf_of;
+    t.reflected = reflected;
+    t.wants_pixel_estimate = true; /* that roulette compares with */
     t.record = record;
     t.flush = flush;
     t.end_pass = end_pass;
