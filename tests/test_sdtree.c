@@ -2349,6 +2349,43 @@ static void test_memory_cap_holds_and_the_field_still_learns(void **state)
     }
 }
 
+/* Cells that come all at once, then rebuild few at a time: the large tree that the others share stays beside the small
+   ones, and the cap leaves less room for nodes than the building trees were given. */
+static void test_memory_cap_holds_while_cells_keep_an_old_tree(void **state)
+{
+    (void)state;
+    for (uint32_t i = 0; i < 24; ++i) {
+        static gsd_training_sample s[20000];
+        gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
+        gsd_field *f;
+        gsd_stats stats;
+        d.max_bytes = (1u << 20) + 65536 * (4 + i / 2);
+        d.alias = i % 2;
+        d.split_samples = 16;
+        d.rho = 1e-5f;
+        d.min_samples = 1;
+        d.no_gate = true;
+        OK(gsd_create(&d, &f));
+        seed(1);
+        for (int pass = 0; pass < 4; ++pass) { /* a point, everywhere, two thin bars */
+            for (int k = 0; k < 20000; ++k) {
+                float p[3], direction[3], L = (float)-log(1 - rnd());
+                for (int axis = 0; axis < 3; ++axis)
+                    p[axis] = pass == 0 ? 0.3f : rndf() * ((pass == 2 && axis < 2) || (pass == 3 && axis) ? 0.1f : 1);
+                random_direction(direction);
+                s[k] = gsd_make_scalar_sample(p, direction, NULL, L, L, L, 0.08f, 0.08f, 0);
+            }
+            learn(f, s, 20000);
+            OK(gsd_refine(f, NULL, NULL, NULL));
+            OK(gsd_validate(f));
+        }
+        gsd_get_stats(f, &stats);
+        assert_true(stats.cells > 50 && stats.nodes > 1000);
+        assert_true(stats.peak_bytes <= d.max_bytes);
+        gsd_destroy(f);
+    }
+}
+
 /* ---- gate */
 
 static gsd_stats gate_after(bool peaked, double light_probability, int passes, gsd_field **keep)
@@ -3076,6 +3113,7 @@ int main(void)
         cmocka_unit_test(test_lost_samples_are_counted),
         cmocka_unit_test(test_queries_do_not_allocate),
         cmocka_unit_test(test_memory_cap_holds_and_the_field_still_learns),
+        cmocka_unit_test(test_memory_cap_holds_while_cells_keep_an_old_tree),
         cmocka_unit_test(test_gate_closes_where_light_is_even),
         cmocka_unit_test(test_gate_stays_open_where_light_is_peaked),
         cmocka_unit_test(test_gate_leaves_rarely_lit_cells_open),
