@@ -69,9 +69,13 @@ report $? 'half the speed: called slower, not biased'
 measure bright "$tmp/bright" --seconds 2 --seeds 3 --methods pt,sdtree
 [ $status -eq 2 ] && [ "$(grep -c BIASED "$tmp/log")" -eq 2 ] && ! grep -q SLOWER "$tmp/log"
 report $? 'light 3 % too bright: called biased for both methods, not slower'
+cp "$tmp/log" "$tmp/log-bright"
 measure crash "$tmp/crash" --spp 4 --seeds 1 --methods pt,sdtree
 [ "$(grep -c ',ok,' "$tmp/out-crash/rows.csv")" -eq 3 ] && grep -q ',b,sdtree,4spp,1,signal 11,' "$tmp/out-crash/rows.csv"
 report $? 'a crash marks its row and the rest goes on'
+grep -q 'sdtree against pt: .* tiles used, untested' "$tmp/log" && ! grep -q trusted "$tmp/log" &&
+    grep -q 'sdtree against pt: .* tiles trusted' "$tmp/log-bright"
+report $? 'variances of one picture are called untested, those of three are tested'
 
 # Cut a row in half, as a lost machine would: it is rendered again, the others are not.
 csv=$tmp/out-same/rows.csv
