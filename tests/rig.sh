@@ -8,18 +8,8 @@ build=${BUILD:-build}
 rig=$build/bench_error render=$build/render
 tmp=$(mktemp -d) || exit 1
 trap 'rm -rf "$tmp"' EXIT
-count=0 bad=0
-
-report() { # report STATUS NAME
-    count=$((count + 1))
-    if [ "$1" -eq 0 ]; then
-        echo "ok $count - $2"
-    else
-        bad=$((bad + 1))
-        echo "not ok $count - $2"
-        tail -n 15 "$tmp/log" | sed 's/^/# /'
-    fi
-}
+log=$tmp/log
+. tests/tap.sh
 
 # Half the budget, and twice the time said to be spent: what a renderer of half the speed would do.
 cat >"$tmp/slow" <<SH
@@ -97,5 +87,4 @@ done
 [ $status -ne 9 ] && grep -q '"relmse": ' "$tmp/out-same/rows.json" && grep -q '^| cornell | 2s | pt (b) |' "$tmp/out-same/table.md"
 report $? 'plots, JSON and a table are written'
 
-echo "1..$count"
-[ "$bad" -eq 0 ]
+finish

@@ -12,21 +12,10 @@ make_reference=$PWD/${BUILD:-build}/make_reference
 program=$render
 tmp=$(mktemp -d) || exit 1
 trap 'rm -rf "$tmp"' EXIT
+log=$tmp/log
+. tests/tap.sh
 cd "$tmp" || exit 1
-count=0 bad=0
 
-report() { # report STATUS NAME: 0 = ok; shows the last command's output where it is not
-    count=$((count + 1))
-    if [ "$1" -eq 0 ]; then
-        echo "ok $count - $2"
-    else
-        bad=$((bad + 1))
-        echo "not ok $count - $2"
-        sed 's/^/# /' log | head -n 12
-        [ -n "${why-}" ] && echo "# $why"
-    fi
-    why=
-}
 # refuses NAME PATTERN ARGUMENTS...: exit status 1 and a message on stderr that matches PATTERN (extended, any case).
 refuses() {
     local name=$1 pattern=$2 status
@@ -303,5 +292,4 @@ echo '<scene/>' >inner.xml
 report $? 'make_reference: another mesh or included file is another state'
 program=$render
 
-echo "1..$count"
-[ "$bad" -eq 0 ]
+finish
