@@ -107,17 +107,6 @@ static bool parse_positive(const char *text, double *value)
     return end != text && *end == 0 && isfinite(*value) && *value > 0;
 }
 
-static bool parse_size(const char *text, int *w, int *h)
-{
-    char first[8];
-    size_t n = strcspn(text, "x");
-    if (n >= sizeof first || text[n] != 'x')
-        return false;
-    memcpy(first, text, n);
-    first[n] = 0;
-    return parse_int(first, 1, 16384, w) && parse_int(text + n + 1, 1, 16384, h);
-}
-
 static bool apply_text(options *o, const char *name, const char *value)
 {
     struct {
@@ -540,18 +529,6 @@ static int total_rounds(const state *s) { return s->h.rounds[MAIN] + s->h.rounds
 
 static uint64_t state_sum(const state *s) { return fnv(fnv(FNV_START, s->data, data_bytes(s)), s->run, run_bytes(s)); }
 
-static bool make_dirs(const char *path)
-{
-    char part[PATH_SIZE];
-    for (size_t i = 1; path[i - 1]; ++i)
-        if (path[i] == '/' || !path[i]) {
-            snprintf(part, sizeof part, "%.*s", (int)i, path);
-            if (mkdir(part, 0777) != 0 && errno != EEXIST)
-                return false;
-        }
-    return access(path, W_OK) == 0;
-}
-
 /* Written beside the old one and renamed over it: an interruption leaves either. */
 static bool state_save(state *s)
 {
@@ -608,7 +585,7 @@ static int state_open(state *s, const options *o, uint64_t key)
     if (!s->data || !s->run)
         return die("out of memory for the sums; choose a smaller --size");
     int n = snprintf(s->path, sizeof s->path, "%s/%016llx.state", o->state_dir, (unsigned long long)key);
-    if (n < 0 || n >= (int)sizeof s->path || !make_dirs(o->state_dir))
+    if (n < 0 || n >= (int)sizeof s->path || !make_folders(o->state_dir) || access(o->state_dir, W_OK) != 0)
         return die("%s: cannot be created or written: %s; choose another --state", o->state_dir, strerror(errno));
     if (!state_lock(s))
         return PROGRAM_FAILED;
