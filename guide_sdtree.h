@@ -4167,17 +4167,27 @@ static void gsdi_sum_up(gsd_tree *tree)
         }
 }
 
+/* Masses of an inner node's children, from the shares that sampling uses: leaves' densities hold little of what was
+   learned where desc.uniform is large, and nothing where it is 1. */
+static void gsdi_export_shares(const gsd_node *node, float mass, float value[4])
+{
+    uint32_t k;
+    for (k = 0; k < 4; ++k) {
+        float sx = node->inner.split[0], sy = node->inner.split[1 + (k & 1)];
+        value[k] = mass * (k & 1 ? 1 - sx : sx) * (k & 2 ? 1 - sy : sy);
+    }
+}
+
 static void gsdi_export_sampling(const gsd_field *field, const gsdi_tree *from, gsd_tree *tree)
 {
-    const gsd_node *nodes = gsdi_nodes(field->block) + from->first;
-    double e = (double)field->block->uniform;
+    const gsd_node *all = gsdi_nodes(field->block), *nodes = all + from->first;
     uint32_t i;
-    for (i = 0; i < from->groups * 4; ++i) {
-        double area = 12.566370614359172 * pow(0.25, (double)(nodes[i].leaf.x >> 24)), learned;
-        bool leaf = nodes[i].leaf.child == 0;
-        learned = leaf ? ((double)nodes[i].leaf.pdf - e * 0.07957747154594766788) / (1 - e) * area : 0;
-        tree->child[i] = leaf ? 0 : (nodes[i].inner.child - from->first) / 4;
-        tree->value[i] = (float)(learned > 0 ? learned : 0);
+    if (from->groups)
+        gsdi_export_shares(&all[from->root], 1, tree->value);
+    for (i = 0; i < from->groups * 4; ++i) { /* parents first */
+        tree->child[i] = nodes[i].inner.child ? (nodes[i].inner.child - from->first) / 4 : 0;
+        if (tree->child[i])
+            gsdi_export_shares(&nodes[i], tree->value[i], tree->value + (size_t)tree->child[i] * 4);
     }
 }
 
