@@ -6,6 +6,7 @@
 #   make bench-readme                     put the last bench's figures into the README
 #   make bench-error [PRESET=quick|full]  error against run time: tables and plots in out/bench-error-PRESET
 #   make stress      hostile and extreme input for every header, STRESS_SECONDS=30 STRESS_SEED=1 STRESS_ONLY=group
+#                    STRESS_CASES=50: so many cases a group instead, the same on every machine
 #   make format      clang-format in place  make lint        only check
 #
 #   config=release|debug|scalar|sanitize|tsan|coverage    each has its own folder (build/, build-debug/, ...)
@@ -250,7 +251,7 @@ stress:
 	$(SUB) run-stress
 
 run-stress: $(STRESSES)
-	@CONFIG=$(config) SECONDS_ALL='$(STRESS_SECONDS)' SEED='$(STRESS_SEED)' ONLY='$(STRESS_ONLY)' \
+	@CONFIG=$(config) SECONDS_ALL='$(STRESS_SECONDS)' CASES='$(STRESS_CASES)' SEED='$(STRESS_SEED)' ONLY='$(STRESS_ONLY)' \
 		bash tests/stress.sh $(STRESSES)
 
 # Write down how many tests there are now: `make test` fails when fewer run.

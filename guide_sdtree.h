@@ -102,9 +102,10 @@
      directions: skip three levels, carry the cosine), 12 per leaf with desc.alias, 4 per spatial node, and 16 KB.
      Building part: 12 bytes per quadtree node, sizeof(gsd_cell_state) (below 600) per cell.
      max_bytes bounds the peak of both parts while refine runs, old and new together: trees coarsen and cells stop
-     splitting; it never fails. Streams (44 bytes per sample) and the scratch of accumulate (at most 13 MB and 8 bytes
-     per cell, kept for the next call) come on top. Allocation happens in create, stream_create, record, accumulate,
-     refine, import, load, gsd_forest_split; never in a query. Stack: below 16 KB per call.
+     splitting; it never fails. (Only what comes from outside can lie above it, and stays: the cells of a forest,
+     imported trees.) Streams (44 bytes per sample) and the scratch of accumulate (at most 13 MB and 8 bytes per cell,
+     kept for the next call) come on top. Allocation happens in create, stream_create, record, accumulate, refine,
+     import, load, gsd_forest_split; never in a query. Stack: below 16 KB per call.
 
    THREADS: each function has a tag.
      [any thread]   pure function on constant data
@@ -2174,6 +2175,11 @@ typedef struct gsdi_job {
     uint32_t copy;     /* 1: this job copies that tree from the old block */
 } gsdi_job;
 
+/* Building nodes of the new cells that have one sampling tree: all, and of the smallest; a single leaf counts 0. */
+typedef struct gsdi_need {
+    uint64_t nodes, least;
+} gsdi_need;
+
 /* A cell of the new part. */
 typedef struct gsdi_place {
     uint32_t source; /* old cell */
@@ -2198,8 +2204,10 @@ typedef struct gsdi_refinement {
     uint32_t *spatial; /* [spatial_count] */
     uint32_t spatial_count, spatial_capacity;
     gsdi_tree *trees;
+    gsdi_need *needs; /* [trees] */
     uint32_t tree_count;
     uint32_t *old_tree; /* [old trees]: index in the new block + 1 */
+    gsdi_block shape;   /* of the new block */
     void *memory;
     gsdi_block *block;
     gsdi_state *states;
@@ -2216,6 +2224,7 @@ static void gsdi_refinement_free(gsdi_refinement *r)
     gsdi_release(r->desc, r->places);
     gsdi_release(r->desc, r->spatial);
     gsdi_release(r->desc, r->trees);
+    gsdi_release(r->desc, r->needs);
     gsdi_release(r->desc, r->old_tree);
     gsdi_release(r->desc, r->memory);
     gsdi_release(r->desc, r->states);
@@ -2325,12 +2334,15 @@ static uint32_t gsdi_split_bound(const gsdi_refinement *r, const gsdi_state *s)
     return parts > 64 ? 64 : (uint32_t)parts;
 }
 
-/* The new cells. False = out of memory. */
+/* The new cells, r->cell_limit at most; may be called again. False = out of memory. */
 static bool gsdi_split_cells(gsdi_refinement *r)
 {
     gsd_field *field = r->field;
     uint32_t old = field->block->cells, i, nodes = field->block->spatial;
     uint64_t capacity = 0;
+    gsdi_release(r->desc, r->places);
+    gsdi_release(r->desc, r->spatial);
+    r->stats.split_cells = 0;
     for (i = 0; i < old; ++i)
         capacity += r->jobs[i].rebuild && !r->desc->forest_cells ? gsdi_split_bound(r, &field->states[i]) : 1;
     if (capacity > (uint64_t)r->cell_limit)
@@ -2358,16 +2370,6 @@ static bool gsdi_split_cells(gsdi_refinement *r)
     return true;
 }
 
-/* Nodes and cells that fit under max_bytes, when the old and the new part, and scratch, exist together. */
-static uint64_t gsdi_node_limit(const gsdi_refinement *r, uint32_t cells)
-{
-    uint64_t per_cell = 2 * (sizeof(gsdi_state) + sizeof(gsd_cell) + sizeof(gsdi_tree) + 8 * GSDI_BINS) +
-                        sizeof(gsdi_job) + sizeof(gsdi_place) + sizeof(gsdi_tree) + 6 * sizeof(uint32_t) + 64;
-    uint64_t per_node = 2 * (16 + (r->desc->alias ? 9 : 0)) + 2 * 12 + 9;
-    uint64_t fixed = 2 * (GSDI_GRID * 4 + 2048) + sizeof(gsd_field) + cells * per_cell;
-    return fixed < r->desc->max_bytes ? (r->desc->max_bytes - fixed) / per_node : 0;
-}
-
 static uint32_t gsdi_cell_limit(const gsd_desc *desc)
 {
     uint64_t limit = desc->max_bytes / 4 / (2 * sizeof(gsdi_state) + 16 * GSDI_BINS + 512);
@@ -2379,15 +2381,71 @@ static uint64_t gsdi_place_nodes(gsdi_refinement *r)
 {
     uint64_t total = 0;
     uint32_t i;
+    for (i = 0; i < r->tree_count; ++i) {
+        r->needs[i].nodes = 0;
+        r->needs[i].least = (uint64_t)-1;
+    }
     for (i = 0; i < r->cells; ++i) {
         gsdi_place *p = &r->places[i];
         const gsdi_job *job = &r->jobs[p->source];
+        gsdi_need *need = &r->needs[job->tree];
+        uint64_t nodes;
         bool split = p->level != r->field->states[p->source].level;
         p->count = split && p->samples == 0 ? 1 : job->nodes; /* nothing seen there: start small */
         p->first = (uint32_t)total;
         total += p->count;
+        nodes = p->count > 1 ? p->count : 0;
+        need->nodes += nodes;
+        need->least = nodes < need->least ? nodes : need->least;
     }
     return total;
+}
+
+/* Bytes that refine holds beside the old and the new part. */
+static uint64_t gsdi_refine_scratch(const gsdi_block *old, uint64_t nodes, uint64_t places, uint64_t spatial)
+{
+    return old->cells * sizeof(gsdi_job) + nodes * (sizeof(double) + 1) + places * sizeof(gsdi_place) + spatial * 4 +
+           ((uint64_t)old->cells + 1) * (sizeof(gsdi_tree) + sizeof(gsdi_need)) + old->trees * sizeof(uint32_t);
+}
+
+/* Most bytes held at once while refine makes `block` and `nodes` building nodes. */
+static uint64_t gsdi_refine_peak(const gsdi_refinement *r, const gsdi_block *block, uint64_t nodes)
+{
+    const gsd_field *f = r->field;
+    return gsdi_bytes(f->block, f->node_capacity) + (f->state_capacity - f->block->cells) * sizeof(gsdi_state) +
+           gsdi_bytes(block, nodes) +
+           gsdi_refine_scratch(f->block, f->building_nodes, r->place_capacity, r->spatial_capacity);
+}
+
+/* Whether this refine stays under max_bytes, and the next one can. It can where there is room for sampling trees as
+   large as any choice of cells to rebuild makes them and for building trees as they are now: if then no cell splits and
+   all that is rebuilt shrinks to single leaves, the same holds for the refine after it, and so on. */
+static bool gsdi_refine_fits(const gsdi_refinement *r, uint64_t nodes)
+{
+    uint64_t cap = r->desc->max_bytes, most = 8, places = gsdi_cell_limit(r->desc), jumps;
+    gsdi_block now = r->shape, next;
+    uint32_t t;
+    for (t = 0; t < r->tree_count; ++t) { /* a tree that one cell keeps exists beside those that others build */
+        uint64_t tree = r->trees[t].groups ? (uint64_t)r->trees[t].groups * 4 + 1 : 0, least = r->needs[t].least;
+        most += r->needs[t].nodes + (tree > least ? tree - least : 0);
+    }
+    if (nodes >= 0xfffffff0u || most >= 0xfffffff0u)
+        return false;
+    gsdi_block_layout(&now);
+    if (gsdi_refine_peak(r, &now, nodes) > cap)
+        return false;
+    places = places > r->cells ? places : r->cells;
+    jumps = ((uint64_t)r->cells + 2) * GSDI_BINS; /* a tree for every cell */
+    now.jumps = jumps < 0xffffff00u ? (uint32_t)jumps : 0xffffff00u;
+    now.trees = r->cells + 1;
+    next = now;
+    next.nodes = (uint32_t)most;
+    next.aliases = r->desc->alias ? (uint32_t)(most / 4 * 3) + r->cells : 0;
+    gsdi_block_layout(&now);
+    gsdi_block_layout(&next);
+    return gsdi_bytes(&now, nodes) + gsdi_bytes(&next, nodes) +
+               gsdi_refine_scratch(&now, nodes, places, now.spatial + 2 * (places - r->cells)) <=
+           cap;
 }
 
 /* List the sampling trees of the new block: rebuilt ones, and old ones that some cell keeps. */
@@ -2533,12 +2591,7 @@ static void gsdi_pass_scale(gsdi_refinement *r, double samples)
 /* Everything that refine allocates after the structure is known. */
 static bool gsdi_refine_allocate(gsdi_refinement *r, uint32_t building_nodes)
 {
-    gsdi_block shape = *r->field->block;
-    if (!gsdi_list_trees(r, &shape))
-        return false;
-    shape.cells = shape.cell_capacity = r->cells;
-    shape.spatial = r->spatial_count;
-    r->block = gsdi_block_allocate(r->desc, &shape, &r->memory);
+    r->block = gsdi_block_allocate(r->desc, &r->shape, &r->memory);
     r->states = (gsdi_state *)gsdi_allocate(r->desc, r->cells, sizeof(gsdi_state));
     r->child = (uint32_t *)gsdi_allocate(r->desc, building_nodes, sizeof(uint32_t));
     r->sum = (double *)gsdi_allocate(r->desc, building_nodes, sizeof(double));
@@ -2552,7 +2605,7 @@ static uint32_t gsdi_refine_plan(gsdi_refinement *r, gsd_parallel_fn parallel, v
     gsd_field *field = r->field;
     uint32_t old = field->block->cells, i;
     uint64_t total;
-    int tries;
+    bool fits;
     r->jobs = (gsdi_job *)gsdi_allocate(r->desc, old, sizeof *r->jobs);
     r->mass = (double *)gsdi_allocate(r->desc, field->building_nodes, sizeof(double));
     r->depth = (unsigned char *)gsdi_allocate(r->desc, field->building_nodes, 1);
@@ -2565,17 +2618,25 @@ static uint32_t gsdi_refine_plan(gsdi_refinement *r, gsd_parallel_fn parallel, v
         r->stats.waiting_cells += !r->jobs[i].rebuild && s->fresh > 0;
         r->stats.unread_cells += !(s->fresh > 0);
     }
+    r->shape = *field->block;
     r->cell_limit = gsdi_cell_limit(r->desc);
-    if (!gsdi_split_cells(r))
+    r->needs = (gsdi_need *)gsdi_allocate(r->desc, (uint64_t)old + 1, sizeof *r->needs);
+    if (!r->needs || !gsdi_list_trees(r, &r->shape))
         return 0;
-    r->rho = (double)r->desc->rho;
-    for (tries = 0; tries < 64; ++tries) {
-        gsdi_run(parallel, user, old, 16, gsdi_count_nodes, r);
-        total = gsdi_place_nodes(r);
-        if (total <= gsdi_node_limit(r, r->cells) && total < 0xfffffff0u)
-            break;
-        r->rho *= r->rho < 0.9 ? 1.3 : 2;
-    }
+    do {
+        if (!gsdi_split_cells(r))
+            return 0;
+        r->shape.cells = r->shape.cell_capacity = r->cells;
+        r->shape.spatial = r->spatial_count;
+        for (r->rho = (double)r->desc->rho;; r->rho *= r->rho < 0.9 ? 1.3 : 2) {
+            gsdi_run(parallel, user, old, 16, gsdi_count_nodes, r);
+            total = gsdi_place_nodes(r);
+            fits = gsdi_refine_fits(r, total);
+            if (fits || r->rho > 1) /* above 1 all trees are single leaves */
+                break;
+        }
+        r->cell_limit = old + (r->cells - old) / 2;
+    } while (!fits && r->cells > old);
     r->stats.effective_rho = (float)r->rho;
     return total < 0xfffffff0u ? (uint32_t)total : 0;
 }
@@ -2631,11 +2692,7 @@ static void gsdi_judge_cells(gsdi_refinement *r, const gsd_pass *pass, double sa
 static void gsdi_refine_commit(gsdi_refinement *r, uint32_t nodes, double samples)
 {
     gsd_field *field = r->field;
-    gsdi_block *old = field->block;
-    uint64_t peak = gsdi_bytes(old, field->building_nodes) + gsdi_bytes(r->block, nodes) +
-                    old->cells * sizeof(gsdi_job) + field->building_nodes * (sizeof(double) + 1) +
-                    r->place_capacity * sizeof(gsdi_place) + r->spatial_capacity * 4 +
-                    ((uint64_t)old->cells + 1) * sizeof(gsdi_tree) + old->trees * 4;
+    uint64_t peak = gsdi_refine_peak(r, r->block, nodes);
     r->stats.peak_bytes = peak > r->stats.peak_bytes ? peak : r->stats.peak_bytes;
     r->stats.passes++;
     gsdi_release(r->desc, field->memory);
@@ -4110,17 +4167,27 @@ static void gsdi_sum_up(gsd_tree *tree)
         }
 }
 
+/* Masses of an inner node's children, from the shares that sampling uses: leaves' densities hold little of what was
+   learned where desc.uniform is large, and nothing where it is 1. */
+static void gsdi_export_shares(const gsd_node *node, float mass, float value[4])
+{
+    uint32_t k;
+    for (k = 0; k < 4; ++k) {
+        float sx = node->inner.split[0], sy = node->inner.split[1 + (k & 1)];
+        value[k] = mass * (k & 1 ? 1 - sx : sx) * (k & 2 ? 1 - sy : sy);
+    }
+}
+
 static void gsdi_export_sampling(const gsd_field *field, const gsdi_tree *from, gsd_tree *tree)
 {
-    const gsd_node *nodes = gsdi_nodes(field->block) + from->first;
-    double e = (double)field->block->uniform;
+    const gsd_node *all = gsdi_nodes(field->block), *nodes = all + from->first;
     uint32_t i;
-    for (i = 0; i < from->groups * 4; ++i) {
-        double area = 12.566370614359172 * pow(0.25, (double)(nodes[i].leaf.x >> 24)), learned;
-        bool leaf = nodes[i].leaf.child == 0;
-        learned = leaf ? ((double)nodes[i].leaf.pdf - e * 0.07957747154594766788) / (1 - e) * area : 0;
-        tree->child[i] = leaf ? 0 : (nodes[i].inner.child - from->first) / 4;
-        tree->value[i] = (float)(learned > 0 ? learned : 0);
+    if (from->groups)
+        gsdi_export_shares(&all[from->root], 1, tree->value);
+    for (i = 0; i < from->groups * 4; ++i) { /* parents first */
+        tree->child[i] = nodes[i].inner.child ? (nodes[i].inner.child - from->first) / 4 : 0;
+        if (tree->child[i])
+            gsdi_export_shares(&nodes[i], tree->value[i], tree->value + (size_t)tree->child[i] * 4);
     }
 }
 

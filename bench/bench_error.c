@@ -10,6 +10,7 @@
    goes on where the first one stopped. A render that crashes or hangs marks its row, and the rest goes on. */
 #define _DEFAULT_SOURCE
 #include "error_report.h"
+#include "options.h"
 
 #include <errno.h>
 #include <fcntl.h>
@@ -128,7 +129,7 @@ static bool apply(options *o, const char *name, const char *value, bool *known)
         return set_integer(value, 1, 30, &o->jobs);
     int w, h;
     if (!strcmp(name, "--size"))
-        return o->size = value, sscanf(value, "%dx%d", &w, &h) == 2 && w > 0 && h > 0;
+        return o->size = value, parse_size(value, &w, &h);
     if (!strcmp(name, "--nee"))
         return o->nee = value, !strcmp(value, "on") || !strcmp(value, "off");
     if (!strcmp(name, "--references"))
@@ -505,20 +506,6 @@ static int report(const options *o, plan *p, const rows *all)
 
 /* ---- >>main ------------------------------------------------------------------------------------------------- */
 
-static bool make_folders(const char *out)
-{
-    char path[1024];
-    snprintf(path, sizeof path, "%s/pictures", out);
-    for (char *at = path + 1; *at; ++at)
-        if (*at == '/') {
-            *at = 0;
-            mkdir(path, 0755);
-            *at = '/';
-        }
-    mkdir(path, 0755);
-    return access(path, W_OK) == 0;
-}
-
 /* Everything that must hold before hours are spent. */
 static int check(const options *o)
 {
@@ -531,7 +518,9 @@ static int check(const options *o)
             fprintf(stderr, "bench_error: %s has no reference, so no errors are measured; see build/make_reference\n",
                     scene);
     }
-    return make_folders(o->plan.out) ? 0 : die("the folder of --out cannot be made", o->plan.out);
+    int n = snprintf(path, sizeof path, "%s/pictures", o->plan.out);
+    bool made = n < (int)sizeof path && make_folders(path) && access(path, W_OK) == 0;
+    return made ? 0 : die("the folder of --out cannot be made", o->plan.out);
 }
 
 static void plan_text(const options *o, const rows *tasks)

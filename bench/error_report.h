@@ -190,7 +190,8 @@ static evidence gather(const plan *p, const rows *all, const char *scene, column
 typedef struct disagreement {
     double z_all, z_tile; /* of the picture, of the worst tile */
     int x, y;             /* that tile */
-    int tiles, used;      /* used: both variances hold up between halves */
+    int tiles, used;      /* used: both variances hold up between halves, or cannot be tested */
+    bool tested;          /* both sides have two halves; one picture has none */
     double limit;         /* of |z_tile|, Bonferroni-corrected */
 } disagreement;
 
@@ -220,10 +221,11 @@ static double tile_variance(const evidence *e, const double variance[2])
 
 static disagreement disagree(const evidence *a, const evidence *b)
 {
-    disagreement d = {0, 0, 0, 0, 0, 0, 0};
+    disagreement d = {0, 0, 0, 0, 0, 0, false, 0};
     double sum = 0, sum_variance = 0;
     if (!a->count || !b->count || a->width != b->width || a->height != b->height)
         return d;
+    d.tested = a->half[1] > 0 && b->half[1] > 0;
     for (int y = 0; y < a->height; y += TILE)
         for (int x = 0; x < a->width; x += TILE) {
             double ma, mb, va[2], vb[2];
@@ -246,6 +248,15 @@ static disagreement disagree(const evidence *a, const evidence *b)
     d.limit = normal_limit(0.001 / (d.used ? d.used : 1));
     d.z_all = sum_variance > 0 ? sum / sqrt(sum_variance) : 0;
     return d;
+}
+
+/* How many tiles the verdict rests on, and whether their variances could be tested. */
+static void print_tiles(FILE *f, const disagreement *d)
+{
+    if (d->tested)
+        fprintf(f, "%d of %d tiles trusted", d->used, d->tiles);
+    else
+        fprintf(f, "%d of %d tiles used, untested: needs 2 pictures each", d->used, d->tiles);
 }
 
 /* ---- tables */
@@ -398,9 +409,11 @@ static int judge_builds(FILE *f, const plan *p, const rows *all, const char *sce
             disagreement d = disagree(&ea, &eb);
             bool slower = speed.value<SLOWER, biased = fabs(d.z_all)> 5 || fabs(d.z_tile) > d.limit;
             bool worse = error.value > WORSE && !(error.count > 1 && error.low < 1);
-            fprintf(f, "%s, %s: %s against %s: speed %.2fx%s, relMSE %.2fx%s, z %.1f, worst tile %.1f of %.1f%s\n",
+            fprintf(f, "%s, %s: %s against %s: speed %.2fx%s, relMSE %.2fx%s, z %.1f, worst tile %.1f of %.1f%s, ",
                     scene, first.method, other.build, first.build, speed.value, slower ? " SLOWER" : "", error.value,
                     worse ? " WORSE" : "", d.z_all, fabs(d.z_tile), d.limit, biased ? " BIASED" : "");
+            print_tiles(f, &d);
+            fputc('\n', f);
             flags += slower + worse + biased;
             evidence_free(&ea);
         }
@@ -419,8 +432,10 @@ static void compare_methods(FILE *f, const plan *p, const rows *all, const char 
         column other = {p->builds.at[0], p->methods.at[m]};
         evidence ea = gather(p, all, scene, other);
         disagreement d = disagree(&ea, &eb);
-        fprintf(f, "%s: %s against %s: z %.1f, worst tile (%d, %d) %.1f, limit %.1f, %d of %d tiles trusted\n", scene,
-                other.method, first.method, d.z_all, d.x, d.y, fabs(d.z_tile), d.limit, d.used, d.tiles);
+        fprintf(f, "%s: %s against %s: z %.1f, worst tile (%d, %d) %.1f, limit %.1f, ", scene, other.method,
+                first.method, d.z_all, d.x, d.y, fabs(d.z_tile), d.limit);
+        print_tiles(f, &d);
+        fputc('\n', f);
         evidence_free(&ea);
     }
     evidence_free(&eb);

@@ -9,7 +9,7 @@
 
      >>options   command line
      >>settings  what a state belongs to: text and hash
-     >>round     one render in a process of its own: a crash or a lack of memory costs one round
+     >>round     one render in a process of its own: a crash or a lack of memory costs one round; the scene's files
      >>state     sums on disk
      >>error     relMSE of the mean, and of the run that is to be measured
      >>check     z-test over tiles
@@ -105,17 +105,6 @@ static bool parse_positive(const char *text, double *value)
     char *end;
     *value = strtod(text, &end);
     return end != text && *end == 0 && isfinite(*value) && *value > 0;
-}
-
-static bool parse_size(const char *text, int *w, int *h)
-{
-    char first[8];
-    size_t n = strcspn(text, "x");
-    if (n >= sizeof first || text[n] != 'x')
-        return false;
-    memcpy(first, text, n);
-    first[n] = 0;
-    return parse_int(first, 1, 16384, w) && parse_int(text + n + 1, 1, 16384, h);
 }
 
 static bool apply_text(options *o, const char *name, const char *value)
@@ -295,7 +284,7 @@ static bool hash_file(const char *path, uint64_t *h)
     return ok;
 }
 
-/* Of the bytes of the scene file and the settings. Files that the scene names are not looked into. */
+/* Of the settings and of the bytes of the scene file. hash_files adds the files that the scene names. */
 static int hash_settings(const options *o, uint64_t *h)
 {
     const char *scenes[] = {o->scene, o->check_scene};
@@ -444,6 +433,64 @@ static bool render_round(const options *o, const job *j, bool say, answer *a, fl
     return ok;
 }
 
+/* What the scenes read besides themselves. */
+typedef struct scene_files {
+    const char *scene; /* that is loading */
+    bool ok;
+    uint64_t hash;
+    char err[512];
+} scene_files;
+
+static void add_file(void *user, const char *path)
+{
+    scene_files *f = user;
+    if (strcmp(path, f->scene) != 0 && !hash_file(path, &f->hash)) {
+        f->ok = false;
+        snprintf(f->err, sizeof f->err, "%.300s: cannot be read: %s", path, strerror(errno));
+    }
+}
+
+/* Runs in the child. */
+static bool child_hash(const options *o, uint64_t hash, int fd)
+{
+    const char *scenes[] = {o->scene, o->check_scene};
+    scene_files f = {.ok = true, .hash = hash};
+    for (int i = 0; i < 2 && f.ok; ++i) {
+        tr_log log = {.on_file = add_file, .user = &f};
+        f.scene = scenes[i];
+        if (scenes[i] && !tr_scene_load(scenes[i], o->defines, o->define_count, o->threads, &log)) {
+            f.ok = false;
+            snprintf(f.err, sizeof f.err, "%.500s", log.last);
+        }
+    }
+    return write_all(fd, &f, sizeof f);
+}
+
+/* Add the meshes, textures, spectra and included files that the scenes read, whatever their names: a scene that is one
+   file keeps its hash. They are loaded in a process of its own, as rounds do. */
+static int hash_files(const options *o, uint64_t *hash)
+{
+    scene_files f = {.ok = false};
+    int fds[2];
+    fflush(NULL);
+    if (pipe(fds) != 0)
+        return die("no pipe: %s", strerror(errno));
+    pid_t child = fork();
+    if (child == 0) {
+        close(fds[0]);
+        _exit(child_hash(o, *hash, fds[1]) ? 0 : 1);
+    }
+    close(fds[1]);
+    bool got = child > 0 && read_all(fds[0], &f, sizeof f);
+    close(fds[0]);
+    while (child > 0 && waitpid(child, NULL, 0) < 0 && errno == EINTR) {
+    }
+    if (!got || !f.ok)
+        return die("%s", got ? f.err : "the scene could not be loaded: no process or not enough memory for it");
+    *hash = f.hash;
+    return 0;
+}
+
 /* ---- >>state ------------------------------------------------------------------------------------------------ */
 
 typedef struct head {
@@ -481,18 +528,6 @@ static size_t run_bytes(const state *s) { return s->n * sizeof *s->run; }
 static int total_rounds(const state *s) { return s->h.rounds[MAIN] + s->h.rounds[CHECK]; }
 
 static uint64_t state_sum(const state *s) { return fnv(fnv(FNV_START, s->data, data_bytes(s)), s->run, run_bytes(s)); }
-
-static bool make_dirs(const char *path)
-{
-    char part[PATH_SIZE];
-    for (size_t i = 1; path[i - 1]; ++i)
-        if (path[i] == '/' || !path[i]) {
-            snprintf(part, sizeof part, "%.*s", (int)i, path);
-            if (mkdir(part, 0777) != 0 && errno != EEXIST)
-                return false;
-        }
-    return access(path, W_OK) == 0;
-}
 
 /* Written beside the old one and renamed over it: an interruption leaves either. */
 static bool state_save(state *s)
@@ -550,7 +585,7 @@ static int state_open(state *s, const options *o, uint64_t key)
     if (!s->data || !s->run)
         return die("out of memory for the sums; choose a smaller --size");
     int n = snprintf(s->path, sizeof s->path, "%s/%016llx.state", o->state_dir, (unsigned long long)key);
-    if (n < 0 || n >= (int)sizeof s->path || !make_dirs(o->state_dir))
+    if (n < 0 || n >= (int)sizeof s->path || !make_folders(o->state_dir) || access(o->state_dir, W_OK) != 0)
         return die("%s: cannot be created or written: %s; choose another --state", o->state_dir, strerror(errno));
     if (!state_lock(s))
         return PROGRAM_FAILED;
@@ -1051,7 +1086,7 @@ int main(int argc, char **argv)
             fputs(usage_text, stdout);
             return 0;
         }
-    if (parse(&o, argc, argv) || hash_settings(&o, &key) || (o.out && check_output(&o)))
+    if (parse(&o, argc, argv) || hash_settings(&o, &key) || (o.out && check_output(&o)) || hash_files(&o, &key))
         return PROGRAM_FAILED;
     session w = {.o = &o};
     int rc = state_open(&w.s, &o, key);

@@ -6,28 +6,15 @@ export LC_ALL=C
 cd "$(dirname "$0")/.." || exit 1
 tmp=$(mktemp -d) || exit 1
 trap 'rm -rf "$tmp"' EXIT
-count=0 bad=0
+log=$tmp/log
+. tests/tap.sh
 warn="-Wall -Wextra -Wpedantic -Wshadow -Wsign-conversion -Werror"
 
-result() { # result STATUS NAME: one TAP line, with the output of the command where it failed
-    count=$((count + 1))
-    if [ "$1" -eq 0 ]; then
-        echo "ok $count - $2"
-    else
-        bad=$((bad + 1))
-        echo "not ok $count - $2"
-        head -n 12 "$tmp/log" | sed 's/^/# /'
-    fi
-}
-skip() {
-    count=$((count + 1))
-    echo "not ok $count # SKIP $1"
-}
 attempt() { # attempt NAME COMMAND...
     local name=$1
     shift
     "$@" >"$tmp/log" 2>&1
-    result $? "$name"
+    report $? "$name"
 }
 compilers() { # compilers gcc c99 -> the command, empty where it is not installed
     local c=$1
@@ -48,7 +35,7 @@ prefix_of() {
 
 for header in $headers; do
     prefix=$(prefix_of "$header")
-    [ -n "$prefix" ] || { : >"$tmp/log" && result 1 "$header: no prefix known for it" && continue; }
+    [ -n "$prefix" ] || { : >"$tmp/log" && report 1 "$header: no prefix known for it" && continue; }
     macro=$(echo "$prefix" | tr a-z A-Z)
     for language in c c++; do
         extension=$language
@@ -90,11 +77,11 @@ for header in $headers; do
     nm -g --defined-only "$tmp/only.o" | awk '{ print $NF }' | sed 's/^_//' | sort -u >"$tmp/symbols"
     grep -v "^$prefix[i]*_" "$tmp/symbols" >"$tmp/log"
     [ -s "$tmp/symbols" ] && [ ! -s "$tmp/log" ]
-    result $? "$header: external symbols start with ${prefix}_"
+    report $? "$header: external symbols start with ${prefix}_"
     # The implementation has no writable globals (b, d: zeroed and initialised data).
     nm "$tmp/only.o" | awk '$2 ~ /^[bBdDC]$/' >"$tmp/log"
     [ ! -s "$tmp/log" ]
-    result $? "$header: no mutable globals"
+    report $? "$header: no mutable globals"
 
     # Macros: what the header adds to what the standard headers it includes define.
     grep -hoE '^ *# *include *<[a-z_0-9/]+\.h>' "$header" | tr -d ' ' | sort -u >"$tmp/std.h"
@@ -112,7 +99,7 @@ for header in $headers; do
         comm -13 "$tmp/base.m" "$tmp/with.m" | awk '{ print $2 }' | sed 's/(.*//' >"$tmp/macros"
         grep -vE "^(${macro}I?_|GUIDE_)" "$tmp/macros" >"$tmp/log"
         [ -s "$tmp/macros" ] && [ ! -s "$tmp/log" ]
-        result $? "$header: macros start with ${macro}_ ($(echo $part | tr A-Z a-z))"
+        report $? "$header: macros start with ${macro}_ ($(echo $part | tr A-Z a-z))"
     done
 
     # The example of the opening comment, as it stands: from the indented line that is nothing but the #define of the
@@ -134,15 +121,15 @@ for header in $headers; do
         lines=$(grep -c . "$tmp/example.c")
         echo "$lines lines" >"$tmp/log"
         [ "$lines" -le 30 ]
-        result $? "$header: example is at most 30 lines"
+        report $? "$header: example is at most 30 lines"
     else
         echo "no example in its opening comment" >"$tmp/log"
-        result 1 "$header: has an example"
+        report 1 "$header: has an example"
     fi
     # Each function's comment tags and the greppable section names: what the contents list exists.
     grep -oE '>>[a-z_]+' "$header" | sort | uniq -c | awk '$1 < 2 { print $2, "appears once: contents and sections disagree" }' >"$tmp/log"
     [ ! -s "$tmp/log" ]
-    result $? "$header: contents and section tags agree"
+    report $? "$header: contents and section tags agree"
 done
 
 # All headers in one file.
@@ -163,7 +150,7 @@ for example in examples/*.c; do
     line=$(head -n 12 "$example" | grep -m 1 -oE '\b(cc|gcc|clang) -.*' | sed "s, *\\*/ *\$,,; s,   *(.*)\$,,")
     if [ -z "$line" ]; then
         echo "no compile line within its first 12 lines" >"$tmp/log"
-        result 1 "$example: compile line"
+        report 1 "$example: compile line"
         continue
     fi
     # Embree's name differs between versions 3 and 4: the line names one of them.
@@ -172,8 +159,7 @@ for example in examples/*.c; do
     *embree4*) printf '#include <embree4/rtcore.h>\n' | ${compiler:-cc} -E -x c - >/dev/null 2>&1 || line=${line//embree4/embree3} ;;
     esac
     (cd "$tmp/root" && eval "$line") >"$tmp/log" 2>&1
-    result $? "$example: $line"
+    report $? "$example: $line"
 done
 
-echo "1..$count"
-[ "$bad" -eq 0 ]
+finish

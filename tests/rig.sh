@@ -8,18 +8,8 @@ build=${BUILD:-build}
 rig=$build/bench_error render=$build/render
 tmp=$(mktemp -d) || exit 1
 trap 'rm -rf "$tmp"' EXIT
-count=0 bad=0
-
-report() { # report STATUS NAME
-    count=$((count + 1))
-    if [ "$1" -eq 0 ]; then
-        echo "ok $count - $2"
-    else
-        bad=$((bad + 1))
-        echo "not ok $count - $2"
-        tail -n 15 "$tmp/log" | sed 's/^/# /'
-    fi
-}
+log=$tmp/log
+. tests/tap.sh
 
 # Half the budget, and twice the time said to be spent: what a renderer of half the speed would do.
 cat >"$tmp/slow" <<SH
@@ -69,9 +59,13 @@ report $? 'half the speed: called slower, not biased'
 measure bright "$tmp/bright" --seconds 2 --seeds 3 --methods pt,sdtree
 [ $status -eq 2 ] && [ "$(grep -c BIASED "$tmp/log")" -eq 2 ] && ! grep -q SLOWER "$tmp/log"
 report $? 'light 3 % too bright: called biased for both methods, not slower'
+cp "$tmp/log" "$tmp/log-bright"
 measure crash "$tmp/crash" --spp 4 --seeds 1 --methods pt,sdtree
 [ "$(grep -c ',ok,' "$tmp/out-crash/rows.csv")" -eq 3 ] && grep -q ',b,sdtree,4spp,1,signal 11,' "$tmp/out-crash/rows.csv"
 report $? 'a crash marks its row and the rest goes on'
+grep -q 'sdtree against pt: .* tiles used, untested' "$tmp/log" && ! grep -q trusted "$tmp/log" &&
+    grep -q 'sdtree against pt: .* tiles trusted' "$tmp/log-bright"
+report $? 'variances of one picture are called untested, those of three are tested'
 
 # Cut a row in half, as a lost machine would: it is rendered again, the others are not.
 csv=$tmp/out-same/rows.csv
@@ -93,5 +87,4 @@ done
 [ $status -ne 9 ] && grep -q '"relmse": ' "$tmp/out-same/rows.json" && grep -q '^| cornell | 2s | pt (b) |' "$tmp/out-same/table.md"
 report $? 'plots, JSON and a table are written'
 
-echo "1..$count"
-[ "$bad" -eq 0 ]
+finish

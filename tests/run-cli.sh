@@ -12,21 +12,10 @@ make_reference=$PWD/${BUILD:-build}/make_reference
 program=$render
 tmp=$(mktemp -d) || exit 1
 trap 'rm -rf "$tmp"' EXIT
+log=$tmp/log
+. tests/tap.sh
 cd "$tmp" || exit 1
-count=0 bad=0
 
-report() { # report STATUS NAME: 0 = ok; shows the last command's output where it is not
-    count=$((count + 1))
-    if [ "$1" -eq 0 ]; then
-        echo "ok $count - $2"
-    else
-        bad=$((bad + 1))
-        echo "not ok $count - $2"
-        sed 's/^/# /' log | head -n 12
-        [ -n "${why-}" ] && echo "# $why"
-    fi
-    why=
-}
 # refuses NAME PATTERN ARGUMENTS...: exit status 1 and a message on stderr that matches PATTERN (extended, any case).
 refuses() {
     local name=$1 pattern=$2 status
@@ -284,7 +273,23 @@ refuses 'make_reference: a damaged state' 'state: damaged' $make --state whole -
 completes 'make_reference: --cache' $make --state parts --cache --rounds 16 --ratio 2
 [ -s "$(echo parts/????????????????.exr)" ]
 report $? 'make_reference: --cache names the picture by its settings'
+[ -e parts/fafce9b887b3aa38.state ]
+report $? 'make_reference: the state of a scene without other files keeps its name'
+# Rounds of a scene must not be added to those of the scene before one of its files changed.
+scene files.xml '<include filename="inner.xml"/>'
+echo '<scene><shape type="obj"><string name="filename" value="t.obj"/></shape></scene>' >inner.xml
+printf 'v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n' >t.obj
+made=0
+for change in none s/1/2/ s/0/3/; do
+    [ $change = none ] || sed -i.bak "1,2$change" t.obj
+    "$program" files.xml --size 8x8 --round-spp 1 --check-spp 1 --rounds 1 --quiet --measured 1 --state files -o f.exr >out 2>log
+    ls files >>log
+    [ "$(ls files/*.state | wc -l)" -eq $((made += 1)) ] || made=-9
+done
+echo '<scene/>' >inner.xml
+"$program" files.xml --size 8x8 --round-spp 1 --check-spp 1 --rounds 1 --quiet --measured 1 --state files -o f.exr >out 2>>log
+[ "$(ls files/*.state | wc -l)" -eq 4 ] && [ $made -eq 3 ]
+report $? 'make_reference: another mesh or included file is another state'
 program=$render
 
-echo "1..$count"
-[ "$bad" -eq 0 ]
+finish

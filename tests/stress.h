@@ -7,7 +7,8 @@
    fail, which is a loss as well.
 
      --seconds S   for all groups together (default 30)    --seed N    default 1
-     --only NAME   one group                               --cases N   so many cases a group, whatever they take
+     --only NAME   one group                               --cases N   so many cases a group, whatever they take: the
+                                                                       same tries on every machine
      --case N      this case only, without a process of its own (for a debugger)
      --rows        rows of the table only                  --list      names of the groups
 
@@ -229,14 +230,14 @@ static void stress_one(stress *s, const stress_group *g, long number)
     }
 }
 
-/* Faults on purpose. What they cost and give does not count. */
-static void stress_plant(stress *s, const stress_group *g, double seconds)
+/* Faults on purpose, all of them or by time. What they cost and give does not count. */
+static void stress_plant(stress *s, const stress_group *g, bool all, double seconds)
 {
     stress_tally keep = *s->tally;
     double end = stress_clock() + seconds;
     long i;
     s->sabotage = true;
-    for (i = 0; i < STRESS_PLANTED && (i < 4 || stress_clock() < end); ++i) {
+    for (i = 0; i < STRESS_PLANTED && (all || i < 4 || stress_clock() < end); ++i) {
         long lost = s->tally->lost;
         stress_one(s, g, i);
         keep.planted += s->deviating;
@@ -252,8 +253,8 @@ static void stress_cases(stress *s, const stress_group *g, const stress_options 
     struct rusage usage;
     double end;
     long i;
-    alarm((unsigned)(20 * seconds) + 120); /* a case that hangs */
-    stress_plant(s, g, 0.15 * seconds);
+    alarm(o->cases >= 0 ? 1800 : (unsigned)(20 * seconds) + 120); /* a case that hangs */
+    stress_plant(s, g, o->cases >= 0, 0.15 * seconds);
     end = stress_clock() + 0.85 * seconds;
     for (i = 0; o->cases >= 0 ? i < o->cases : i < 1 || stress_clock() < end; ++i)
         stress_one(s, g, i);

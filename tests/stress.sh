@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Run the stress programs given; one table of their groups. Exit status 1 where something was lost.
-# Environment: CONFIG, SECONDS_ALL (for all programs together), SEED, ONLY (name of one group).
+# Environment: CONFIG, SECONDS_ALL (for all programs together), CASES (so many a group instead), SEED, ONLY (name of one
+# group).
 export LC_ALL=C
 cd "$(dirname "$0")/.." || exit 1
 : "${CONFIG:=release}" "${SECONDS_ALL:=30}" "${SEED:=1}"
@@ -18,11 +19,13 @@ rows=$(mktemp) || exit 1
 trap 'rm -f "$rows"' EXIT
 each=$SECONDS_ALL
 [ -n "${ONLY-}" ] || each=$(awk "BEGIN { print $SECONDS_ALL / $# }")
-printf 'config %s, seed %s, %s seconds\n' "$CONFIG" "$SEED" "$SECONDS_ALL"
+amount="$SECONDS_ALL seconds"
+[ -z "${CASES-}" ] || amount="$CASES cases a group"
+printf 'config %s, seed %s, %s\n' "$CONFIG" "$SEED" "$amount"
 printf '%-8s %-20s %9s %9s %9s %6s %9s %7s %6s\n' header group tried refused survived lost faults seconds MB
 failed=0
 for program in "$@"; do
-    "$program" --rows --seconds "$each" --seed "$SEED" ${ONLY:+--only "$ONLY"} | tee -a "$rows"
+    "$program" --rows --seconds "$each" --seed "$SEED" ${CASES:+--cases "$CASES"} ${ONLY:+--only "$ONLY"} | tee -a "$rows"
     status=${PIPESTATUS[0]}
     [ "$status" = 0 ] || [ "$status" = 3 ] || failed=1 # 3: has no group ONLY
 done

@@ -1,7 +1,7 @@
 /* test_scene.c: scene files, meshes, shapes and glTF of the example renderer (examples/tracer).
 
    contents: >>files >>transforms >>spelling >>parameters >>colours >>materials >>emitters >>camera >>shapes >>meshes
-             >>serialized >>gltf >>bad >>code >>flips >>real
+             >>serialized >>gltf >>files >>bad >>code >>flips >>real
 
    GUIDE_SCENES=folder loads the downloaded scenes too (veach-ajar, veach-bidir, living-room, kitchen). */
 #include <stdlib.h>
@@ -1024,6 +1024,54 @@ static void test_gltf_without_camera_and_lights(void **state)
     assert_non_null(strstr(said, "scene.gltf: error:"));
 }
 
+/* ---- >>files ------------------------------------------------------------------------------------------------ */
+
+static void note_file(void *user, const char *path)
+{
+    char *list = user;
+    const char *slash = strrchr(path, '/');
+    strcat(list, slash ? slash + 1 : path);
+    strcat(list, " ");
+}
+
+/* Everything that decides what is seen is told, so that a caller can notice that it changed. */
+static void test_files_that_are_read_are_told(void **state)
+{
+    (void)state;
+    char list[400] = "";
+    tr_log log = {.on_file = note_file, .user = list};
+    write_text("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n");
+    write_text("a.spd", "400 0.5 700 0.5");
+    write_exr("a.exr", 4, 2);
+    write_text("other.xml", "<scene><shape type='obj'><string name='filename' value='a.obj'/>"
+                            "<bsdf type='diffuse'><texture name='reflectance' type='bitmap'>"
+                            "<string name='filename' value='a.exr'/></texture></bsdf></shape></scene>");
+    const char *xml = write_text("scene.xml", "<scene version='3.0.0'><include filename='other.xml'/>" LIGHT
+                                              "<shape type='sphere'><bsdf type='diffuse'><spectrum name='reflectance' "
+                                              "filename='a.spd'/></bsdf></shape></scene>");
+    tr_scene *s = tr_scene_load(xml, NULL, 0, 1, &log);
+    assert_non_null(s);
+    assert_non_null(strstr(list, "scene.xml "));
+    assert_non_null(strstr(list, "other.xml "));
+    assert_non_null(strstr(list, "a.obj "));
+    assert_non_null(strstr(list, "a.exr "));
+    assert_non_null(strstr(list, "a.spd "));
+    tr_scene_free(s);
+    /* The importer of glTF reads its buffers itself. */
+    static char text[8192];
+    unsigned char binary[GLTF_BINARY];
+    const char *embedded = gltf_text(true, true, binary), *at = strstr(embedded, "\"byteLength\":68}");
+    assert_non_null(at);
+    snprintf(text, sizeof text, "%.*s\"byteLength\":68,\"uri\" : \"a.spd\"}%s", (int)(at - embedded), embedded,
+             at + 16);
+    write_file("a.spd", binary, sizeof binary);
+    *list = 0;
+    s = tr_scene_load(write_text("scene.gltf", text), NULL, 0, 1, &log);
+    assert_non_null(s);
+    assert_string_equal(list, "scene.gltf a.spd ");
+    tr_scene_free(s);
+}
+
 /* ---- >>bad -------------------------------------------------------------------------------------------------- */
 
 /* What must be said, with its place, for a scene whose body starts in line 2. */
@@ -1408,6 +1456,7 @@ int main(void)
         cmocka_unit_test(test_serialized),
         cmocka_unit_test(test_gltf),
         cmocka_unit_test(test_gltf_without_camera_and_lights),
+        cmocka_unit_test(test_files_that_are_read_are_told),
         cmocka_unit_test(test_bad_scenes_name_file_and_line),
         cmocka_unit_test(test_bad_sensors),
         cmocka_unit_test(test_bad_files),

@@ -137,6 +137,28 @@ static const char *json_text(unsigned char *data, size_t size)
     return (const char *)data + 20;
 }
 
+/* Tell of the files that the JSON text names: buffers, which the importer reads, and images. */
+static void tell_files(tr_log *log, const char *path, const char *json)
+{
+    for (const char *at = json; at && (at = strstr(at, "\"uri\"")) != NULL;) {
+        char name[1024];
+        at += 5;
+        at += strspn(at, " \t\r\n:");
+        size_t n = *at == '"' ? strcspn(at + 1, "\"") : 0;
+        if (n == 0 || n >= sizeof name || strncmp(at + 1, "data:", 5) == 0)
+            continue;
+        memcpy(name, at + 1, n);
+        name[n] = 0;
+        char *file = tr_path_beside(path, name);
+        FILE *f = file ? fopen(file, "rb") : NULL;
+        if (f) {
+            fclose(f);
+            tr_file_used(log, file);
+        }
+        free(file);
+    }
+}
+
 /* ---- >>images ----------------------------------------------------------------------------------------------- */
 
 typedef struct pixels {
@@ -556,6 +578,8 @@ bool tr_gltf_load(tr_scene *scene, const char *path, tr_log *log)
     g.ai = survives ? import(path) : NULL;
     if (g.ai && g.ai->mNumMeshes) {
         g.json = json_text(data, size);
+        tr_file_used(log, path);
+        tell_files(log, path, g.json);
         read_scene(&g);
     } else {
         tr_message(log, TR_ERROR, path, 0, "not a usable glTF file: %.200s",

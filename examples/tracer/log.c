@@ -1,4 +1,4 @@
-/* log.c: messages about a scene, with file and line. */
+/* log.c: messages about a scene, with file and line; the files that it is made of. */
 #include "tracer.h"
 
 static const char *const level_names[3] = {"note", "warning", "error"};
@@ -28,4 +28,10 @@ void tr_message(tr_log *log, tr_level level, const char *file, int line, const c
         fprintf(log->out, "%s%s: %s\n", where, level_names[level], text);
     else if (*count == TR_LOG_SHOWN + 1)
         fprintf(log->out, "%s: more of these are not shown\n", level_names[level]);
+}
+
+void tr_file_used(tr_log *log, const char *path)
+{
+    if (log && log->on_file)
+        log->on_file(log->user, path);
 }

@@ -70,21 +70,6 @@ static bool parse_double(const char *text, double *value)
     return end != text && *end == 0 && isfinite(*value);
 }
 
-static bool parse_size(const char *text, int *w, int *h)
-{
-    char *end;
-    long a = strtol(text, &end, 10);
-    if (end == text || *end != 'x')
-        return false;
-    const char *second = end + 1;
-    long b = strtol(second, &end, 10);
-    if (end == second || *end || a < 1 || b < 1 || a > 16384 || b > 16384)
-        return false;
-    *w = (int)a;
-    *h = (int)b;
-    return true;
-}
-
 static bool parse_switch(const char *text, bool *on)
 {
     *on = !strcmp(text, "on");

@@ -34,11 +34,14 @@ typedef struct tr_log {
     FILE *out;
     int notes, warnings, errors;
     char last[512];
+    void (*on_file)(void *user, const char *path); /* told of every file that was read, in the same order each time */
+    void *user;
 } tr_log;
 #define TR_LOG_SHOWN 40
 
 /* file may be NULL; line 0 = no line. Prints "file:line: warning: text". */
 void tr_message(tr_log *log, tr_level level, const char *file, int line, const char *format, ...);
+void tr_file_used(tr_log *log, const char *path); /* called by the loaders */
 
 /* ---- >>image ------------------------------------------------------------------------------------------------ */
 

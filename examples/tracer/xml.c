@@ -304,7 +304,9 @@ static bool load_mesh(xml_reader *r, xnode *node, const mat4 *m, tr_shape *s)
     xnode *name = xml_child(node, "filename");
     char *path = xml_path(r, node, "filename");
     bool ok = path && tr_mesh_load(s, path, &o, err, sizeof err);
-    if (path && !ok)
+    if (ok)
+        tr_file_used(r->log, path);
+    else if (path)
         xml_say(r, TR_ERROR, name ? name : node, "%s%s%s", strstr(err, path) ? "" : path, strstr(err, path) ? "" : ": ",
                 err);
     free(path);

@@ -69,6 +69,7 @@ bool xml_read_image(xml_reader *r, xnode *node, const char *path, bool raw, floa
         xml_say(r, TR_ERROR, node, "cannot read the image: %s", err);
         return false;
     }
+    tr_file_used(r->log, path);
     if (image->width <= 0 || image->height <= 0 || !three_channels(image)) {
         xml_say(r, TR_ERROR, node, "the image '%s' is empty", path);
         tr_image_free(image);

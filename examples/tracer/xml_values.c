@@ -248,9 +248,10 @@ static vec3 spectrum_file(xml_reader *r, xnode *n, const char *name, bool emissi
     char *path = tr_path_beside(n->file, name);
     unsigned char *data = path ? tr_file_read(path, &size, err, sizeof err) : NULL;
     vec3 rgb = {0, 0, 0};
-    if (data)
+    if (data) {
+        tr_file_used(r->log, path);
         rgb = spectrum_list(r, n, (const char *)data, emission);
-    else
+    } else
         xml_say(r, TR_ERROR, n, "%s", path ? err : "out of memory");
     free(data);
     free(path);

@@ -387,6 +387,7 @@ static bool parse_file(xtree *t, const char *path, xnode *into)
         t->failed = true;
         return false;
     }
+    tr_file_used(t->log, path);
     reader r = {t, XML_ParserCreate(NULL), path, into, 0, false};
     bool ok = r.parser != NULL;
     if (ok) {
