@@ -38,7 +38,8 @@
      >>types     descriptor, sample, results   >>batch   find, sample, pdf of arrays
      >>field     create, refine, stats         >>store   save, load, merge, export, import
      implementation:
-     >>memory  >>math  >>streams  >>trees  >>accumulate  >>gate  >>block  >>refine  >>life  >>forest  >>batches
+     >>memory  >>math  >>streams  >>trees  >>denoise  >>accumulate  >>gate  >>block  >>refine  >>life  >>forest
+   >>batches
      >>files  >>check  >>plain  >>licence
 
    HOW IT WORKS
@@ -73,6 +74,13 @@
      Smoothing: what few samples say is uncertain. The shares of a node's children in the sampling tree are
      (n share + K / 4) / (n + K), n = the node's non-zero samples (mass share times the cell's), K = desc.smoothing.
 
+     Denoising: before it rebuilds a tree, refine moves the leaves' masses by a share t towards the mean of the eight
+     squares of their size around them (phi wraps, poles are crossed), a blur whose width follows the tree. t comes from
+     the data: the samples of a leaf are gathered in two halves, and t is what lets each half say most of the other
+     (largest sum of mass_other log density), converted to that of both together, t / (2 - t). Trees whose halves agree
+     best without a blur stay as they are. On by default; the idea is that of Nilsson's thesis [Nilsson], whose fixed
+     Gaussians and matrices this does without.
+
      Selection probability: handle.alpha is the probability to sample the BSDF; 1 means: do not guide here. The caller
      draws from the BSDF with alpha, else from gsd_sample, and divides by alpha pdf_bsdf + (1 - alpha) gsd_pdf.
 
@@ -100,7 +108,7 @@
    MEMORY
      Sampling part: 16 bytes per quadtree node, 40 per cell, 32 per quadtree, 512 per learned quadtree (bins of
      directions: skip three levels, carry the cosine), 12 per leaf with desc.alias, 4 per spatial node, and 16 KB.
-     Building part: 12 bytes per quadtree node, sizeof(gsd_cell_state) (below 600) per cell.
+     Building part: 20 bytes per quadtree node, sizeof(gsd_cell_state) (below 600) per cell.
      max_bytes bounds the peak of both parts while refine runs, old and new together: trees coarsen and cells stop
      splitting; it never fails. (Only what comes from outside can lie above it, and stays: the cells of a forest,
      imported trees.) Streams (44 bytes per sample) and the scratch of accumulate (at most 13 MB and 8 bytes per cell,
@@ -135,6 +143,7 @@
      T. Mueller 2019, "Practical Path Guiding" in Production, ch. 10 of SIGGRAPH course Path Guiding in Production.
      J. Vorba, J. Krivanek 2016, Adjoint-Driven Russian Roulette and Splitting in Light Transport Simulation.
      A. Rath, P. Grittmann, S. Herholz, P. Vevoda, P. Slusallek, J. Krivanek 2020, Variance-Aware Path Guiding.
+     J. Nilsson, thesis on denoising the quadtrees of path guiding, Chalmers University of Technology.
      A. Walker 1977, An Efficient Method for Generating Discrete Random Variables with General Distributions (alias).
      D. Kingma, J. Ba 2015, Adam. */
 #ifndef GUIDE_SDTREE_H
@@ -148,7 +157,7 @@
 #include <stdint.h>
 #include <string.h>
 
-#define GSD_VERSION 2 /* of the saved format */
+#define GSD_VERSION 3 /* of the saved format */
 
 #ifndef GSD_API /* linkage of the functions; e.g. static */
 #define GSD_API extern
@@ -233,6 +242,7 @@ typedef struct gsd_desc {
     bool no_gate;  /* guide in every cell */
     bool no_guide_weight;  /* second-moment targets: w = 1 */
     bool no_history;       /* clear the sums in every refine; see HOW IT WORKS */
+    bool no_denoise;       /* quadtrees as they were gathered */
     float smoothing;       /* K, samples' worth of evenness, see HOW IT WORKS, 0.001 .. 1000; default 3 */
     bool alias;            /* build alias tables: sampling in constant time, but not monotone in u; + 12 bytes a leaf */
     float gate_margin;     /* V(1) / V(a) - 1 below which guiding does not pay, 0.001 .. 10; default 0.05 */
@@ -295,6 +305,7 @@ typedef struct gsd_stats {
     uint32_t rebuilt_trees;  /* last refine: cells with new samples */
     uint32_t waiting_cells;  /* last refine: too few new samples, tree kept */
     uint32_t unread_cells;   /* last refine: no new samples: no work done */
+    uint32_t denoised_trees; /* last refine: blurred; the other rebuilt ones are better as they are */
     uint32_t open_cells;     /* gate: guiding shown to pay */
     uint32_t closed_cells;   /* gate: shown not to pay; alpha = 1 */
     uint32_t unjudged_cells; /* gate: guiding (once there is a tree), no verdict yet */
@@ -302,6 +313,7 @@ typedef struct gsd_stats {
     float mean_depth;        /* mean over trees of leaf depth weighted by mass; 0 = nothing learned */
     float closed_share;      /* share of the last pass's samples in closed cells, 0 .. 1 */
     float mean_alpha;        /* over the last pass's samples, closed cells as 1 */
+    float mean_blur;         /* of the trees that the last refine rebuilt: how far shares moved towards those around */
     float reserved;
 } gsd_stats;
 
@@ -925,8 +937,11 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_SPLIT 2.0            /* a cell splits above that times sqrt(samples held): tuned on SF1 (1 .. 2), ajar */
 #define GSDI_MIN_SPLIT 32.0       /* at least */
 #define GSDI_LIT                                                                                                       \
-    24.0 /* ... times its share of non-zero samples: parts of a dark cell would know too little;                       \
-            tuned on lamps, ajar (8 .. 32) */
+    24.0                    /* ... times its share of non-zero samples: parts of a dark cell would know too little;    \
+                               tuned on lamps, ajar (8 .. 32) */
+#define GSDI_BLUR_EVEN 0.05 /* share of evenness in the density that one half of the samples says of the other */
+#define GSDI_BLUR_MOST 0.6  /* of the way towards the surroundings, for one half */
+#define GSDI_BLUR_STEPS 5   /* halvings of the interval that holds the best blur */
 #define GSDI_MAX_CELLS (1u << 26)
 
 /* ---- >>memory ----------------------------------------------------------------------------------------------- */
@@ -999,6 +1014,11 @@ typedef struct gsdi_state {
     uint32_t bins[64]; /* held by 4 x 4 x 4 sub-cells, index x y z with 2 bits each, for several splits at once */
 } gsdi_state;
 
+/* What a leaf of a building tree has gathered, by halves of its samples: what one half says is tested on the other. */
+typedef struct gsdi_sum {
+    double half[2];
+} gsdi_sum;
+
 /* A quadtree of the sampling part. */
 typedef struct gsdi_tree {
     uint32_t root;   /* node; 0 = uniform */
@@ -1027,7 +1047,7 @@ struct gsd_field {
     gsdi_block *block; /* 64-byte aligned within memory */
     gsdi_state *states;
     uint32_t *child; /* building nodes: first child relative to the tree's root, 0 = leaf */
-    double *sum;     /* leaves: sums; inner nodes: scratch of refine */
+    gsdi_sum *sum;   /* leaves: sums; inner nodes: scratch of refine */
     uint32_t building_nodes;
     uint32_t passes;
     double first_pass_samples, last_pass_samples;
@@ -1199,7 +1219,8 @@ GSD_API gsd_result gsd_record_cells(gsd_stream *stream, const uint32_t *cells, c
 typedef struct gsdi_visit {
     uint32_t node, x, y, depth;
     uint32_t out; /* node in another tree */
-    double mass, sum;
+    double mass;
+    gsdi_sum sum;
 } gsdi_visit;
 
 /* Leaf of a building tree at 24-bit coordinates; *depth = its depth. */
@@ -1220,8 +1241,8 @@ typedef struct gsdi_square {
 } gsdi_square;
 
 /* Add weight * (overlap area) to every leaf below `root` that overlaps [x0, x1) x [y0, y1), which lies within it. */
-static void gsdi_splat_rectangle(const uint32_t *child, double *sum, gsdi_square root, const uint32_t x[2],
-                                 const uint32_t y[2], double weight)
+static void gsdi_splat_rectangle(const uint32_t *child, gsdi_sum *sum, uint32_t half_of, gsdi_square root,
+                                 const uint32_t x[2], const uint32_t y[2], double weight)
 {
     gsdi_square stack[GSDI_STACK];
     uint32_t top = 0, k;
@@ -1234,7 +1255,7 @@ static void gsdi_splat_rectangle(const uint32_t *child, double *sum, gsdi_square
         if (xa >= xb || ya >= yb)
             continue;
         if (!c) {
-            sum[b.node] += weight * ((double)(xb - xa) * (double)(yb - ya));
+            sum[b.node].half[half_of] += weight * ((double)(xb - xa) * (double)(yb - ya));
             continue;
         }
         for (k = 4; k-- > 0;) {
@@ -1250,13 +1271,13 @@ static void gsdi_splat_rectangle(const uint32_t *child, double *sum, gsdi_square
 /* Box filter [Mueller 2019]: spread value over a box of the size of the leaf at (x, y), centred there. phi wraps; what
    passes a pole comes back at phi + half a turn. The sum over all leaves grows by value. The box overlaps four squares
    of its own size; each is a leaf, part of a larger one, or divided further. */
-static void gsdi_splat_box(const uint32_t *child, double *sum, uint32_t x, uint32_t y, double value)
+static void gsdi_splat_box(const uint32_t *child, gsdi_sum *sum, uint32_t half, uint32_t x, uint32_t y, double value)
 {
     uint32_t depth, leaf = gsdi_building_leaf(child, x, y, &depth);
     int32_t size = 16777216 >> depth, xs[3], ys[3], i, j;
     double weight = value / ((double)size * (double)size);
     if (depth == 0) {
-        sum[leaf] += value;
+        sum[leaf].half[half] += value;
         return;
     }
     xs[0] = (int32_t)x - size / 2;
@@ -1277,7 +1298,7 @@ static void gsdi_splat_box(const uint32_t *child, double *sum, uint32_t x, uint3
             if (width == 0 || height == 0)
                 continue;
             if (xs[i] <= (int32_t)x && (int32_t)x < xs[i + 1] && ys[j] <= (int32_t)y && (int32_t)y < ys[j + 1]) {
-                sum[leaf] += weight * ((double)width * (double)height);
+                sum[leaf].half[half] += weight * ((double)width * (double)height);
                 continue;
             }
             while (child[node] && shift > 24 - depth) {
@@ -1295,33 +1316,40 @@ static void gsdi_splat_box(const uint32_t *child, double *sum, uint32_t x, uint3
                 rx[1] = left + (uint32_t)width;
                 ry[0] = bottom;
                 ry[1] = bottom + (uint32_t)height;
-                gsdi_splat_rectangle(child, sum, root, rx, ry, weight);
+                gsdi_splat_rectangle(child, sum, half, root, rx, ry, weight);
             } else {
-                sum[node] += weight * ((double)width * (double)height);
+                sum[node].half[half] += weight * ((double)width * (double)height);
             }
         }
     }
 }
 
+/* Mass of a leaf: its sum, or the root of sum * solid-angle fraction. */
+static double gsdi_leaf_mass(double sum, bool second_moment, uint32_t depth)
+{
+    return second_moment ? sqrt(sum) * (1.0 / (double)(1u << depth)) : sum;
+}
+
 /* Masses of all nodes of a building tree: leaves' own (or the root of sum * solid-angle fraction for second moments),
    inner nodes the sum of their children; inner sums likewise. Children come after parents. Returns the total. */
-static double gsdi_tree_masses(const uint32_t *child, double *sum, uint32_t count, bool second_moment, double *mass,
+static double gsdi_tree_masses(const uint32_t *child, gsdi_sum *sum, uint32_t count, bool second_moment, double *mass,
                                unsigned char *depth)
 {
-    uint32_t i;
+    uint32_t i, k;
     depth[0] = 0;
     for (i = 0; i < count; ++i) {
         uint32_t c = child[i];
         if (c)
             depth[c] = depth[c + 1] = depth[c + 2] = depth[c + 3] = (unsigned char)(depth[i] + 1);
         else
-            mass[i] = second_moment ? sqrt(sum[i]) * (1.0 / (double)(1u << depth[i])) : sum[i];
+            mass[i] = gsdi_leaf_mass(sum[i].half[0] + sum[i].half[1], second_moment, depth[i]);
     }
     for (i = count; i-- > 0;) {
         uint32_t c = child[i];
         if (c) {
             mass[i] = (mass[c] + mass[c + 1]) + (mass[c + 2] + mass[c + 3]);
-            sum[i] = (sum[c] + sum[c + 1]) + (sum[c + 2] + sum[c + 3]);
+            for (k = 0; k < 2; ++k)
+                sum[i].half[k] = (sum[c].half[k] + sum[c + 1].half[k]) + (sum[c + 2].half[k] + sum[c + 3].half[k]);
         }
     }
     return mass[0];
@@ -1329,8 +1357,8 @@ static double gsdi_tree_masses(const uint32_t *child, double *sum, uint32_t coun
 
 /* Structure for the next pass: a node is divided where its mass exceeds limit; new halves get a quarter each. out_child
    and out_sum (keep times the old sums, pushed down evenly) may be NULL: count only. Returns the number of nodes. */
-static uint32_t gsdi_refine_tree(const uint32_t *child, const double *sum, const double *mass, double limit,
-                                 uint32_t max_depth, double keep, uint32_t *out_child, double *out_sum)
+static uint32_t gsdi_refine_tree(const uint32_t *child, const gsdi_sum *sum, const double *mass, double limit,
+                                 uint32_t max_depth, double keep, uint32_t *out_child, gsdi_sum *out_sum)
 {
     gsdi_visit stack[GSDI_STACK];
     uint32_t total = 1;
@@ -1343,7 +1371,8 @@ static uint32_t gsdi_refine_tree(const uint32_t *child, const double *sum, const
         bool divide = v.mass > limit && v.depth < max_depth;
         if (out_child) {
             out_child[v.out] = divide ? total : 0;
-            out_sum[v.out] = divide ? 0 : v.sum * keep;
+            out_sum[v.out].half[0] = divide ? 0 : v.sum.half[0] * keep;
+            out_sum[v.out].half[1] = divide ? 0 : v.sum.half[1] * keep;
         }
         if (!divide)
             continue;
@@ -1354,11 +1383,159 @@ static uint32_t gsdi_refine_tree(const uint32_t *child, const double *sum, const
             next->depth = v.depth + 1;
             next->out = total + (uint32_t)k;
             next->mass = c ? mass[next->node] : v.mass * 0.25;
-            next->sum = c ? sum[next->node] : v.sum * 0.25;
+            next->sum.half[0] = c ? sum[next->node].half[0] : v.sum.half[0] * 0.25;
+            next->sum.half[1] = c ? sum[next->node].half[1] : v.sum.half[1] * 0.25;
         }
         total += 4;
     }
     return total;
+}
+
+/* ---- >>denoise ---------------------------------------------------------------------------------------------- */
+
+/* What the blur reads and writes of one building tree, shares of the half's or the tree's mass; [nodes] each. */
+typedef struct gsdi_blur {
+    float *half[2]; /* masses that each half of the samples gives, all nodes */
+    float *near[3]; /* leaves: mean of the eight squares around, of each half and of both */
+    double *mass;   /* of both halves, all nodes, not divided by their sum */
+} gsdi_blur;
+#define GSDI_BLUR_BYTES (5 * sizeof(float)) /* a node */
+
+/* A node with the 3 x 3 squares of its size around it: `near` is a node of that size, or the leaf that lies `up` levels
+   above. Row by row, upwards in z. */
+typedef struct gsdi_around {
+    uint32_t node, near[9];
+    int32_t x, y; /* in units of its size */
+    unsigned char depth, up[9];
+} gsdi_around;
+
+/* Child k of a node, with the squares around it: they lie in the squares around the parent. phi wraps; what passes a
+   pole comes back at phi + half a turn. */
+static void gsdi_around_child(const uint32_t *child, const gsdi_around *parent, uint32_t k, gsdi_around *out)
+{
+    int32_t size, i, j;
+    out->node = child[parent->node] + k;
+    out->depth = (unsigned char)(parent->depth + 1);
+    out->x = 2 * parent->x + (int32_t)(k & 1);
+    out->y = 2 * parent->y + (int32_t)(k >> 1);
+    size = (int32_t)(1u << out->depth);
+    for (j = -1; j <= 1; ++j)
+        for (i = -1; i <= 1; ++i) {
+            int32_t x = (int32_t)(k & 1) + i, y = (int32_t)(k >> 1) + j; /* -1 .. 2, from the parent's corner */
+            int32_t from = (x + 2) / 2 + 3 * ((y + 2) / 2), to = (i + 1) + 3 * (j + 1);
+            uint32_t c = parent->up[from] ? 0 : child[parent->near[from]];
+            x += 2 * parent->x;
+            y += 2 * parent->y;
+            if (y < 0 || y >= size) {
+                y = y < 0 ? -1 - y : 2 * size - 1 - y;
+                x += size / 2;
+            }
+            out->near[to] = c ? c + (uint32_t)((x & 1) + 2 * (y & 1)) : parent->near[from];
+            out->up[to] = (unsigned char)(c ? 0 : parent->up[from] + 1);
+        }
+}
+
+/* Means around every leaf, sides counting twice as much as corners. A leaf that is larger counts with the share of its
+   area, a divided square with its sum. */
+static void gsdi_blur_near(const uint32_t *child, gsdi_blur *b)
+{
+    static const float weight[9] = {1, 2, 1, 2, 0, 2, 1, 2, 1};
+    gsdi_around stack[GSDI_STACK];
+    uint32_t top = 0, k;
+    double scale = 1 / b->mass[0];
+    memset(&stack[0], 0, sizeof stack[0]);
+    for (++top; top;) {
+        gsdi_around at = stack[--top];
+        if (child[at.node]) {
+            for (k = 4; k-- > 0;)
+                gsdi_around_child(child, &at, k, &stack[top++]);
+        } else {
+            float sum[3] = {0, 0, 0};
+            for (k = 0; k < 9; ++k) {
+                uint32_t n = at.near[k];
+                float w = weight[k] / 12 / (float)((uint64_t)1 << (2 * at.up[k]));
+                sum[0] += w * b->half[0][n];
+                sum[1] += w * b->half[1][n];
+                sum[2] += w * (float)(b->mass[n] * scale);
+            }
+            for (k = 0; k < 3; ++k)
+                b->near[k][at.node] = sum[k];
+        }
+    }
+}
+
+/* Masses of one half, as shares of their sum; false: there are none. */
+static bool gsdi_blur_half(const uint32_t *child, const gsdi_sum *sum, const unsigned char *depth, uint32_t count,
+                           bool second_moment, uint32_t half, float *mass)
+{
+    double total = 0;
+    uint32_t i;
+    for (i = 0; i < count; ++i)
+        total += child[i] ? 0 : gsdi_leaf_mass(sum[i].half[half], second_moment, depth[i]);
+    if (!(total > 1e-280))
+        return false;
+    for (i = count; i-- > 0;) {
+        const float *c = mass + child[i];
+        mass[i] = child[i] ? (c[0] + c[1]) + (c[2] + c[3])
+                           : (float)(gsdi_leaf_mass(sum[i].half[half], second_moment, depth[i]) / total);
+    }
+    return true;
+}
+
+/* Slope over t of what each half says of the other: sum of mass_other log(density), where the density is that of the
+   half's masses moved by t towards their surroundings, with a share of evenness. It falls with t. */
+static double gsdi_blur_slope(const uint32_t *child, const unsigned char *depth, uint32_t count, const gsdi_blur *b,
+                              const double *scale, double t)
+{
+    double slope = 0;
+    uint32_t i, k;
+    for (i = 0; i < count; ++i) {
+        double even;
+        if (child[i])
+            continue;
+        even = GSDI_BLUR_EVEN / (1 - GSDI_BLUR_EVEN) / (double)((uint64_t)1 << (2 * depth[i]));
+        for (k = 0; k < 2; ++k) {
+            double own = (double)b->half[k][i], move = (double)b->near[k][i] * scale[k] - own;
+            slope += (double)b->half[1 - k][i] * move / (own + t * move + even);
+        }
+    }
+    return slope;
+}
+
+/* Blur the masses of one building tree in place. Returns how far they moved towards their surroundings: 0 = not at all,
+   what one half of the samples says of the other would get worse by any blur. */
+static double gsdi_blur_tree(const uint32_t *child, const gsdi_sum *sum, const unsigned char *depth, uint32_t count,
+                             bool second_moment, gsdi_blur *b)
+{
+    double scale[3] = {0, 0, 0}, low = 0, high = GSDI_BLUR_MOST, total = b->mass[0];
+    uint32_t i, k;
+    for (k = 0; k < 2; ++k)
+        if (!gsdi_blur_half(child, sum, depth, count, second_moment, k, b->half[k]))
+            return 0;
+    gsdi_blur_near(child, b);
+    for (i = 0; i < count; ++i)
+        for (k = 0; k < 3 && !child[i]; ++k)
+            scale[k] += (double)b->near[k][i];
+    for (k = 0; k < 3; ++k)
+        scale[k] = (k < 2 ? 1 : total) / scale[k];
+    if (gsdi_blur_slope(child, depth, count, b, scale, 0) <= 0)
+        return 0;
+    for (k = 0; k < GSDI_BLUR_STEPS; ++k) {
+        double t = 0.5 * (low + high);
+        if (gsdi_blur_slope(child, depth, count, b, scale, t) > 0)
+            low = t;
+        else
+            high = t;
+    }
+    low = low / (2 - low); /* both halves together have half the noise */
+    if (low <= 0)
+        return 0;
+    for (i = count; i-- > 0;) {
+        double *m = b->mass, near = (double)b->near[2][i] * scale[2];
+        uint32_t c = child[i];
+        m[i] = c ? (m[c] + m[c + 1]) + (m[c + 2] + m[c + 3]) : m[i] + low * (near - m[i]);
+    }
+    return low;
 }
 
 /* ---- >>accumulate ------------------------------------------------------------------------------------------- */
@@ -1587,14 +1764,14 @@ static void gsdi_splat(const gsdi_accumulation *a, uint32_t cell, const gsdi_ite
 {
     const gsdi_state *state = &a->field->states[cell];
     const uint32_t *child = a->field->child + state->first;
-    double *sum = a->field->sum + state->first;
-    uint32_t x = item->x & 0xffffffu, y = item->y, depth;
+    gsdi_sum *sum = a->field->sum + state->first;
+    uint32_t x = item->x & 0xffffffu, y = item->y, half = (x ^ y) & 1u, depth;
     if (!(item->pixel > 0))
         return;
     if (a->box)
-        gsdi_splat_box(child, sum, x, y, (double)item->pixel);
+        gsdi_splat_box(child, sum, half, x, y, (double)item->pixel);
     else
-        sum[gsdi_building_leaf(child, x, y, &depth)] += (double)item->pixel;
+        sum[gsdi_building_leaf(child, x, y, &depth)].half[half] += (double)item->pixel;
 }
 
 /* Busy cells [begin, end): statistics, and the quadtree sums where both belong to the same cell. */
@@ -2167,6 +2344,7 @@ static void gsdi_tree_copy(gsdi_block *b, gsdi_tree *tree, gsdi_block *from, con
 
 /* What refine decides about an old cell. */
 typedef struct gsdi_job {
+    double blur;       /* of its tree; 0 = not denoised */
     double limit_mass; /* total mass of its building tree */
     uint32_t rebuild;  /* 1: new sampling tree from the building tree */
     uint32_t groups;   /* of that tree */
@@ -2199,6 +2377,7 @@ typedef struct gsdi_refinement {
     gsdi_job *jobs;       /* [old cells] */
     double *mass;         /* [building nodes] */
     unsigned char *depth; /* [building nodes] */
+    float *blur;          /* [5 * building nodes] */
     gsdi_place *places;   /* [cells] */
     uint32_t cells, cell_limit, place_capacity;
     uint32_t *spatial; /* [spatial_count] */
@@ -2212,7 +2391,7 @@ typedef struct gsdi_refinement {
     gsdi_block *block;
     gsdi_state *states;
     uint32_t *child;
-    double *sum;
+    gsdi_sum *sum;
     gsd_stats stats;
 } gsdi_refinement;
 
@@ -2221,6 +2400,7 @@ static void gsdi_refinement_free(gsdi_refinement *r)
     gsdi_release(r->desc, r->jobs);
     gsdi_release(r->desc, r->mass);
     gsdi_release(r->desc, r->depth);
+    gsdi_release(r->desc, r->blur);
     gsdi_release(r->desc, r->places);
     gsdi_release(r->desc, r->spatial);
     gsdi_release(r->desc, r->trees);
@@ -2234,7 +2414,7 @@ static void gsdi_refinement_free(gsdi_refinement *r)
 
 static uint64_t gsdi_bytes(const gsdi_block *b, uint64_t building_nodes)
 {
-    return b->size + 64 + building_nodes * (sizeof(uint32_t) + sizeof(double)) + b->cells * sizeof(gsdi_state) +
+    return b->size + 64 + building_nodes * (sizeof(uint32_t) + sizeof(gsdi_sum)) + b->cells * sizeof(gsdi_state) +
            sizeof(gsd_field);
 }
 
@@ -2253,6 +2433,26 @@ static void gsdi_measure(void *context, uint32_t begin, uint32_t end)
                                            r->second_moment, r->mass + s->first, r->depth + s->first);
         job->rebuild = s->held >= (double)r->desc->min_samples && job->limit_mass > 1e-280;
         job->groups = (s->count - 1) / 4;
+    }
+}
+
+/* Denoise the masses of the old cells' building trees. */
+static void gsdi_denoise(void *context, uint32_t begin, uint32_t end)
+{
+    gsdi_refinement *r = (gsdi_refinement *)context;
+    uint32_t c, k;
+    for (c = begin; c < end; ++c) {
+        const gsdi_state *s = &r->field->states[c];
+        gsdi_job *job = &r->jobs[c];
+        gsdi_blur b;
+        if (!job->rebuild || s->count < 5)
+            continue;
+        for (k = 0; k < 5; ++k)
+            *(k < 2 ? &b.half[k] : &b.near[k - 2]) = r->blur + 5 * (size_t)s->first + (size_t)k * s->count;
+        b.mass = r->mass + s->first;
+        job->blur = gsdi_blur_tree(r->field->child + s->first, r->field->sum + s->first, r->depth + s->first, s->count,
+                                   r->second_moment, &b);
+        job->limit_mass = b.mass[0];
     }
 }
 
@@ -2408,12 +2608,14 @@ static uint64_t gsdi_refine_scratch(const gsdi_block *old, uint64_t nodes, uint6
            ((uint64_t)old->cells + 1) * (sizeof(gsdi_tree) + sizeof(gsdi_need)) + old->trees * sizeof(uint32_t);
 }
 
-/* Most bytes held at once while refine makes `block` and `nodes` building nodes. */
+/* Most bytes held at once while refine makes `block` and `nodes` building nodes. What denoising takes is gone by then;
+   it is no more than a new part with as many building nodes as the old one. */
 static uint64_t gsdi_refine_peak(const gsdi_refinement *r, const gsdi_block *block, uint64_t nodes)
 {
     const gsd_field *f = r->field;
+    uint64_t next = gsdi_bytes(block, nodes), blur = r->desc->no_denoise ? 0 : f->building_nodes * GSDI_BLUR_BYTES;
     return gsdi_bytes(f->block, f->node_capacity) + (f->state_capacity - f->block->cells) * sizeof(gsdi_state) +
-           gsdi_bytes(block, nodes) +
+           (next > blur ? next : blur) +
            gsdi_refine_scratch(f->block, f->building_nodes, r->place_capacity, r->spatial_capacity);
 }
 
@@ -2521,7 +2723,7 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
         const gsdi_state *old = &r->field->states[p->source];
         const gsdi_job *job = &r->jobs[p->source];
         const uint32_t *child = r->field->child + old->first;
-        const double *sum = r->field->sum + old->first;
+        const gsdi_sum *sum = r->field->sum + old->first;
         gsdi_state *s = &r->states[i];
         double total = 0, share, keep = 0;
         *s = *old;
@@ -2531,8 +2733,7 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
         memcpy(s->origin, p->origin, sizeof s->origin);
         if (!job->rebuild) {
             memcpy(r->child + p->first, child, p->count * sizeof *child);
-            for (k = 0; k < p->count; ++k)
-                r->sum[p->first + k] = child[k] ? 0 : sum[k];
+            memcpy(r->sum + p->first, sum, p->count * sizeof *sum);
         } else {
             for (k = 0; k < 64; ++k)
                 total += (double)old->bins[k];
@@ -2553,8 +2754,7 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
         if (r->clear) { /* another target: what waits is of no use */
             s->held = s->lit = 0;
             memset(s->bins, 0, sizeof s->bins);
-            for (k = 0; k < p->count; ++k)
-                r->sum[p->first + k] = 0;
+            memset(r->sum + p->first, 0, p->count * sizeof *r->sum);
         }
         s->fresh = s->flow = 0;
         s->hits = 0;
@@ -2594,7 +2794,7 @@ static bool gsdi_refine_allocate(gsdi_refinement *r, uint32_t building_nodes)
     r->block = gsdi_block_allocate(r->desc, &r->shape, &r->memory);
     r->states = (gsdi_state *)gsdi_allocate(r->desc, r->cells, sizeof(gsdi_state));
     r->child = (uint32_t *)gsdi_allocate(r->desc, building_nodes, sizeof(uint32_t));
-    r->sum = (double *)gsdi_allocate(r->desc, building_nodes, sizeof(double));
+    r->sum = (gsdi_sum *)gsdi_allocate(r->desc, building_nodes, sizeof(gsdi_sum));
     return r->block && r->states && r->child && r->sum;
 }
 
@@ -2605,19 +2805,28 @@ static uint32_t gsdi_refine_plan(gsdi_refinement *r, gsd_parallel_fn parallel, v
     gsd_field *field = r->field;
     uint32_t old = field->block->cells, i;
     uint64_t total;
+    double blur = 0;
     bool fits;
     r->jobs = (gsdi_job *)gsdi_allocate(r->desc, old, sizeof *r->jobs);
     r->mass = (double *)gsdi_allocate(r->desc, field->building_nodes, sizeof(double));
     r->depth = (unsigned char *)gsdi_allocate(r->desc, field->building_nodes, 1);
-    if (!r->jobs || !r->mass || !r->depth)
+    r->blur = (float *)gsdi_allocate(r->desc, r->desc->no_denoise ? 1 : field->building_nodes, GSDI_BLUR_BYTES);
+    if (!r->jobs || !r->mass || !r->depth || !r->blur)
         return 0;
     gsdi_run(parallel, user, old, 16, gsdi_measure, r);
+    if (!r->desc->no_denoise)
+        gsdi_run(parallel, user, old, 16, gsdi_denoise, r);
+    gsdi_release(r->desc, r->blur);
+    r->blur = NULL;
     for (i = 0; i < old; ++i) {
         const gsdi_state *s = &field->states[i];
         r->stats.rebuilt_trees += r->jobs[i].rebuild;
+        r->stats.denoised_trees += r->jobs[i].blur > 0;
+        blur += r->jobs[i].blur;
         r->stats.waiting_cells += !r->jobs[i].rebuild && s->fresh > 0;
         r->stats.unread_cells += !(s->fresh > 0);
     }
+    r->stats.mean_blur = r->stats.rebuilt_trees ? (float)(blur / r->stats.rebuilt_trees) : 0;
     r->shape = *field->block;
     r->cell_limit = gsdi_cell_limit(r->desc);
     r->needs = (gsdi_need *)gsdi_allocate(r->desc, (uint64_t)old + 1, sizeof *r->needs);
@@ -2732,6 +2941,7 @@ GSD_API gsd_result gsd_refine(gsd_field *field, const gsd_pass *pass, gsd_parall
     r.desc = &field->desc;
     r.stats = field->stats;
     r.stats.split_cells = r.stats.rebuilt_trees = r.stats.waiting_cells = r.stats.unread_cells = 0;
+    r.stats.denoised_trees = 0;
     r.second_moment = field->target != GSD_TARGET_RADIANCE;
     for (i = 0; i < field->block->cells; ++i)
         samples += field->states[i].fresh;
@@ -2915,7 +3125,7 @@ GSD_API gsd_result gsd_create(const gsd_desc *desc, gsd_field **out)
     field->block = gsdi_block_allocate(&d, &shape, &field->memory);
     field->states = (gsdi_state *)gsdi_allocate(&d, cells, sizeof *field->states);
     field->child = (uint32_t *)gsdi_allocate(&d, (uint64_t)cells * nodes, sizeof(uint32_t));
-    field->sum = (double *)gsdi_allocate(&d, (uint64_t)cells * nodes, sizeof(double));
+    field->sum = (gsdi_sum *)gsdi_allocate(&d, (uint64_t)cells * nodes, sizeof(gsdi_sum));
     if (!field->block || !field->states || !field->child || !field->sum || (uint64_t)cells * nodes > 0xfffffff0u) {
         gsd_destroy(field);
         return GSD_OUT_OF_MEMORY;
@@ -3029,7 +3239,7 @@ static bool gsdi_forest_reserve(gsd_field *field, uint32_t cells, uint64_t nodes
     if (wanted > field->node_capacity) {
         uint64_t capacity = wanted + wanted / 2 < 0xfffffff0u ? wanted + wanted / 2 : wanted;
         uint32_t *child = (uint32_t *)gsdi_allocate(d, capacity, sizeof *child);
-        double *sum = (double *)gsdi_allocate(d, capacity, sizeof *sum);
+        gsdi_sum *sum = (gsdi_sum *)gsdi_allocate(d, capacity, sizeof *sum);
         if (!child || !sum) {
             gsdi_release(d, child);
             gsdi_release(d, sum);
@@ -3052,7 +3262,7 @@ static void gsdi_forest_copy(gsd_field *field, uint32_t cell, uint32_t from)
     gsdi_state *s = &field->states[cell];
     *s = field->states[from];
     memcpy(field->child + field->building_nodes, field->child + s->first, s->count * sizeof(uint32_t));
-    memcpy(field->sum + field->building_nodes, field->sum + s->first, s->count * sizeof(double));
+    memcpy(field->sum + field->building_nodes, field->sum + s->first, s->count * sizeof(gsdi_sum));
     s->first = field->building_nodes;
     field->building_nodes += s->count;
     field->guiding -= gsdi_cells(field->block)[cell].alpha < 1;
@@ -3076,14 +3286,15 @@ GSD_API gsd_result gsd_forest_split(gsd_field *field, uint32_t parent, uint32_t 
     for (i = old; i < cells; ++i) {
         gsdi_start_state(&field->desc, &field->states[i], field->building_nodes, nodes);
         gsdi_start_tree(field->child + field->building_nodes, depth);
-        memset(field->sum + field->building_nodes, 0, nodes * sizeof(double));
+        memset(field->sum + field->building_nodes, 0, nodes * sizeof(gsdi_sum));
         field->building_nodes += nodes;
         gsdi_cell_write(field->block, gsdi_trees(field->block), &gsdi_cells(field->block)[i], &field->states[i], 0);
     }
     field->block->cells = cells;
     s = &field->states[parent];
     for (i = 0; i < s->count; ++i)
-        field->sum[s->first + i] *= 0.5;
+        for (k = 0; k < 2; ++k)
+            field->sum[s->first + i].half[k] *= 0.5;
     s->held *= 0.5;
     s->lit *= 0.5;
     s->fresh *= 0.5;
@@ -3681,6 +3892,7 @@ GSD_API void gsd_sample_batch(const gsd_view *view, uint32_t count, const uint32
     X(uint32_t, no_gate, bool)                                                                                         \
     X(uint32_t, no_guide_weight, bool)                                                                                 \
     X(uint32_t, no_history, bool)                                                                                      \
+    X(uint32_t, no_denoise, bool)                                                                                      \
     X(uint32_t, alias, bool)                                                                                           \
     X(float, split_samples, float)                                                                                     \
     X(float, rho, float)                                                                                               \
@@ -3709,7 +3921,7 @@ typedef struct gsdi_file {
 
 static uint64_t gsdi_file_size(uint64_t block_size, uint64_t cells, uint64_t nodes)
 {
-    return sizeof(gsdi_file) + block_size + cells * sizeof(gsdi_state) + nodes * (sizeof(uint32_t) + sizeof(double));
+    return sizeof(gsdi_file) + block_size + cells * sizeof(gsdi_state) + nodes * (sizeof(uint32_t) + sizeof(gsdi_sum));
 }
 
 /* Block size without the room to grow. */
@@ -3793,7 +4005,7 @@ GSD_API gsd_result gsd_save(const gsd_field *field, void *data, size_t capacity,
     at = gsdi_put(at, (const char *)b + sizeof shape, (size_t)f.block_size - sizeof shape);
     at = gsdi_put(at, field->states, b->cells * sizeof(gsdi_state));
     at = gsdi_put(at, field->child, nodes * sizeof(uint32_t));
-    gsdi_put(at, field->sum, nodes * sizeof(double));
+    gsdi_put(at, field->sum, nodes * sizeof(gsdi_sum));
     f.checksum = gsdi_file_checksum(&f, (const unsigned char *)data + sizeof f, (size_t)f.size - sizeof f);
     memcpy(data, &f, sizeof f);
     *size = (size_t)f.size;
@@ -3857,7 +4069,7 @@ GSD_API gsd_result gsd_load(const gsd_desc *desc, const void *data, size_t size,
     field->block = gsdi_block_allocate(&d, &shape, &field->memory);
     field->states = (gsdi_state *)gsdi_allocate(&d, f.cells, sizeof *field->states);
     field->child = (uint32_t *)gsdi_allocate(&d, f.building_nodes, sizeof(uint32_t));
-    field->sum = (double *)gsdi_allocate(&d, f.building_nodes, sizeof(double));
+    field->sum = (gsdi_sum *)gsdi_allocate(&d, f.building_nodes, sizeof(gsdi_sum));
     if (!field->block || !field->states || !field->child || !field->sum) {
         gsd_destroy(field);
         return GSD_OUT_OF_MEMORY;
@@ -3868,7 +4080,7 @@ GSD_API gsd_result gsd_load(const gsd_desc *desc, const void *data, size_t size,
     at += f.cells * sizeof *field->states;
     memcpy(field->child, at, f.building_nodes * sizeof(uint32_t));
     at += f.building_nodes * sizeof(uint32_t);
-    memcpy(field->sum, at, f.building_nodes * sizeof(double));
+    memcpy(field->sum, at, f.building_nodes * sizeof(gsdi_sum));
     field->building_nodes = field->node_capacity = f.building_nodes;
     field->state_capacity = f.cells;
     field->passes = f.passes;
@@ -4007,7 +4219,7 @@ static bool gsdi_spatial_ok(const gsd_field *field, const gsd_view *view)
 static bool gsdi_building_ok(const gsd_field *field, const gsdi_state *s)
 {
     const uint32_t *child;
-    const double *sum;
+    const gsdi_sum *sum;
     uint32_t used = 1, top = 0, k;
     struct gsdi_down {
         uint32_t node, depth;
@@ -4021,8 +4233,9 @@ static bool gsdi_building_ok(const gsd_field *field, const gsdi_state *s)
     while (top) {
         v = stack[--top];
         if (child[v.node] == 0) {
-            if (!(sum[v.node] >= 0) || !(sum[v.node] < 1e300))
-                return false;
+            for (k = 0; k < 2; ++k)
+                if (!(sum[v.node].half[k] >= 0) || !(sum[v.node].half[k] < 1e300))
+                    return false;
             continue;
         }
         if (child[v.node] <= v.node || s->count < 5 || child[v.node] > s->count - 4 || used >= s->count ||
@@ -4110,7 +4323,8 @@ GSD_API gsd_result gsd_merge(gsd_field *field, const gsd_field *source)
         field->target != source->target)
         return GSD_MISMATCH;
     for (i = 0; i < field->building_nodes; ++i)
-        field->sum[i] += source->sum[i];
+        for (k = 0; k < 2; ++k)
+            field->sum[i].half[k] += source->sum[i].half[k];
     for (i = 0; i < field->block->cells; ++i) {
         gsdi_state *s = &field->states[i];
         const gsdi_state *o = &source->states[i];
@@ -4197,7 +4411,7 @@ static void gsdi_export_building(const gsd_field *field, const gsdi_state *s, gs
         uint32_t inner, depth;
     } stack[GSDI_STACK], v;
     const uint32_t *child = field->child + s->first;
-    const double *sum = field->sum + s->first;
+    const gsdi_sum *sum = field->sum + s->first;
     bool second_moment = field->target != GSD_TARGET_RADIANCE;
     uint32_t top = 0, k;
     stack[top].inner = stack[top].depth = 0;
@@ -4206,7 +4420,7 @@ static void gsdi_export_building(const gsd_field *field, const gsdi_state *s, gs
         v = stack[--top];
         for (k = 0; k < 4; ++k) {
             uint32_t node = 1 + v.inner * 4 + k, c = child[node];
-            double own = second_moment ? sqrt(sum[node]) / (double)(1u << (v.depth + 1)) : sum[node];
+            double own = gsdi_leaf_mass(sum[node].half[0] + sum[node].half[1], second_moment, v.depth + 1);
             tree->child[v.inner * 4 + k] = c ? (c - 1) / 4 : 0;
             tree->value[v.inner * 4 + k] = (float)(c ? 0 : own < 3e38 ? own : 3e38);
             if (c) {
@@ -4219,16 +4433,18 @@ static void gsdi_export_building(const gsd_field *field, const gsdi_state *s, gs
 
 GSD_API gsd_result gsd_export_tree(const gsd_field *field, gsd_part part, gsd_tree *tree)
 {
+    const gsdi_sum *root;
     uint32_t count, k;
     if (tree->cell >= field->block->cells)
         return GSD_BAD_CELL;
+    root = &field->sum[field->states[tree->cell].first];
     count = gsdi_inner_nodes(field, part, tree->cell);
     if (tree->count < count)
         return GSD_BUFFER_TOO_SMALL;
     tree->count = count;
     for (k = 0; k < 4; ++k) { /* what a single leaf gives */
         tree->child[k] = 0;
-        tree->value[k] = part == GSD_PART_SAMPLING ? 0.25f : (float)(field->sum[field->states[tree->cell].first] / 4);
+        tree->value[k] = part == GSD_PART_SAMPLING ? 0.25f : (float)((root->half[0] + root->half[1]) / 4);
     }
     if (part == GSD_PART_SAMPLING)
         gsdi_export_sampling(field, &gsdi_trees(field->block)[gsdi_cells(field->block)[tree->cell].tree], tree);

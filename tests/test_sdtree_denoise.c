@@ -1,0 +1,460 @@
+/* test_sdtree_denoise.c: how guide_sdtree.h denoises quadtrees, against plain references in double precision.
+
+   gcc -std=c11 -O2 -I. tests/test_sdtree_denoise.c -lcmocka -lm -lpthread */
+#define _POSIX_C_SOURCE 200809L
+#include "cmocka_prelude.h"
+
+#include <float.h>
+#include <math.h>
+#include <pthread.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define GSD_IMPLEMENTATION
+#include "guide_sdtree.h"
+
+#include "denoise_naive.h"
+
+#define PI 3.14159265358979323846
+#define OK(call) assert_int_equal((call), GSD_OK)
+
+/* ---- helpers */
+
+static uint64_t rng_state = 1;
+
+static double rnd(void)
+{
+    uint64_t z = rng_state += 0x9e3779b97f4a7c15ull;
+    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9ull;
+    z = (z ^ (z >> 27)) * 0x94d049bb133111ebull;
+    return (double)((z ^ (z >> 31)) >> 11) * 0x1p-53;
+}
+
+#define MOST 6000 /* nodes of a test's tree */
+
+typedef struct tree {
+    uint32_t child[MOST], count;
+    gsdi_sum sum[MOST];
+    double mass[MOST];
+    unsigned char depth[MOST];
+    float work[5][MOST];
+    gsdi_blur blur;
+} tree;
+
+/* Divide node at random, or only towards the corner (0, 0) where chance < 0. */
+static void grow(tree *t, uint32_t node, uint32_t depth, uint32_t deepest, double chance, bool corner)
+{
+    if (depth == deepest || t->count + 4 > MOST || !(depth == 0 || (chance < 0 ? corner : rnd() < chance)))
+        return;
+    uint32_t c = t->child[node] = t->count;
+    t->count += 4;
+    for (uint32_t k = 0; k < 4; ++k)
+        grow(t, c + k, depth + 1, deepest, chance, corner && k == 0);
+}
+
+static void measure(tree *t, bool second_moment)
+{
+    gsdi_tree_masses(t->child, t->sum, t->count, second_moment, t->mass, t->depth);
+    t->blur.mass = t->mass;
+    for (int k = 0; k < 5; ++k)
+        *(k < 2 ? &t->blur.half[k] : &t->blur.near[k - 2]) = t->work[k];
+}
+
+static tree *make_tree(uint64_t seed, uint32_t deepest, double chance)
+{
+    tree *t = calloc(1, sizeof *t);
+    assert_non_null(t);
+    rng_state = seed;
+    t->count = 1;
+    grow(t, 0, 0, deepest, chance, true);
+    for (uint32_t i = 0; i < t->count; ++i)
+        for (int k = 0; k < 2 && !t->child[i]; ++k)
+            t->sum[i].half[k] = rnd() < 0.2 ? 0 : pow(10, 4 * rnd());
+    return t;
+}
+
+/* Masses of `mass` (leaves count) as a matrix 2^layer wide: leaves above by area, subtrees below as their sum. */
+static void flatten(const tree *t, const double *mass, uint32_t node, uint32_t depth, uint32_t x, uint32_t y,
+                    dn_matrix *m, uint32_t layer)
+{
+    if (t->child[node] && depth < layer) {
+        for (uint32_t k = 0; k < 4; ++k)
+            flatten(t, mass, t->child[node] + k, depth + 1, 2 * x + (k & 1), 2 * y + (k >> 1), m, layer);
+        return;
+    }
+    uint32_t n = 1u << (layer - depth);
+    for (uint32_t j = y * n; j < (y + 1) * n; ++j)
+        for (uint32_t i = x * n; i < (x + 1) * n; ++i)
+            m->v[(size_t)j * m->width + i] = mass[node] / ((double)n * n);
+}
+
+/* Mean around the square (x, y) of a layer. */
+static double around(const dn_matrix *m, long x, long y)
+{
+    double sum = 0;
+    for (long j = -1; j <= 1; ++j)
+        for (long i = -1; i <= 1; ++i) {
+            long at = dn_index((long)m->width, y + j, x + i, DN_SPHERE);
+            sum += i || j ? (i && j ? 1 : 2) / 12.0 * m->v[at] : 0;
+        }
+    return sum;
+}
+
+/* Compare what the blur found around every leaf with the matrix of that leaf's layer. */
+static void compare(const tree *t, const double *mass, const float *near, double scale, uint32_t node, uint32_t depth,
+                    uint32_t x, uint32_t y)
+{
+    if (t->child[node]) {
+        for (uint32_t k = 0; k < 4; ++k)
+            compare(t, mass, near, scale, t->child[node] + k, depth + 1, 2 * x + (k & 1), 2 * y + (k >> 1));
+        return;
+    }
+    dn_matrix m = dn_new_matrix(1u << depth);
+    flatten(t, mass, 0, 0, 0, 0, &m, depth);
+    double expected = around(&m, x, y) * scale, got = (double)near[node];
+    if (fabs(got - expected) > 2e-6 * expected + 1e-30)
+        fail_msg("around (%u, %u) at depth %u: %g, expected %g", x, y, depth, got, expected);
+    dn_free_matrix(&m);
+}
+
+/* ---- the blur of one tree */
+
+static void test_surroundings_match_matrices(void **state)
+{
+    (void)state;
+    for (uint64_t seed = 1; seed <= 60; ++seed) {
+        bool second = seed & 1;
+        tree *t = make_tree(seed, 1 + seed % 8, seed % 5 == 0 ? -1 : 0.7);
+        double own[MOST], sum[2] = {0, 0};
+        measure(t, second);
+        for (uint32_t h = 0; h < 2; ++h)
+            assert_true(gsdi_blur_half(t->child, t->sum, t->depth, t->count, second, h, t->blur.half[h]));
+        gsdi_blur_near(t->child, &t->blur);
+        compare(t, t->mass, t->blur.near[2], 1 / t->mass[0], 0, 0, 0, 0);
+        for (uint32_t h = 0; h < 2; ++h) { /* masses of the halves, bottom up */
+            for (uint32_t i = t->count; i-- > 0;) {
+                uint32_t c = t->child[i];
+                own[i] = c ? own[c] + own[c + 1] + own[c + 2] + own[c + 3]
+                           : gsdi_leaf_mass(t->sum[i].half[h], second, t->depth[i]);
+                sum[h] += c ? 0 : own[i];
+            }
+            for (uint32_t i = 0; i < t->count; ++i)
+                assert_true(fabs((double)t->blur.half[h][i] - own[i] / sum[h]) <= 2e-6 * own[i] / sum[h]);
+            compare(t, own, t->blur.near[h], 1 / sum[h], 0, 0, 0, 0);
+        }
+        free(t);
+    }
+}
+
+/* What half h says of the other at t, straight from the definition. */
+static double score(const tree *t, const double *scale, double move)
+{
+    double sum = 0;
+    for (uint32_t i = 0; i < t->count; ++i)
+        for (int h = 0; h < 2 && !t->child[i]; ++h) {
+            double own = (double)t->blur.half[h][i], near = (double)t->blur.near[h][i] * scale[h];
+            double density =
+                (1 - GSDI_BLUR_EVEN) * ((1 - move) * own + move * near) + GSDI_BLUR_EVEN * pow(0.25, t->depth[i]);
+            sum += (double)t->blur.half[1 - h][i] * log(density);
+        }
+    return sum;
+}
+
+static void test_strength_is_where_the_halves_agree_best(void **state)
+{
+    (void)state;
+    int moved = 0, still = 0;
+    for (uint64_t seed = 1; seed <= 60; ++seed) {
+        bool second = seed & 1;
+        tree *t = make_tree(seed, 3 + seed % 4, 0.8);
+        for (uint32_t i = 0; i < t->count; ++i) /* from equal halves to independent ones */
+            for (int k = 0; k < 2; ++k)
+                t->sum[i].half[k] = pow(t->sum[i].half[0], 1 - (double)(seed % 7) / 6) *
+                                    pow(1 + t->sum[i].half[1], (double)(seed % 7) / 6 * (k ? 1 : rnd()));
+        measure(t, second);
+        double scale[2] = {0, 0}, best = 0,
+               got = gsdi_blur_tree(t->child, t->sum, t->depth, t->count, second, &t->blur);
+        for (uint32_t i = 0; i < t->count; ++i)
+            for (int h = 0; h < 2 && !t->child[i]; ++h)
+                scale[h] += (double)t->blur.near[h][i];
+        for (int h = 0; h < 2; ++h)
+            scale[h] = 1 / scale[h];
+        for (double at = 0.05; at < 0.6; at += 0.1) { /* the slope by finite differences */
+            double slope = gsdi_blur_slope(t->child, t->depth, t->count, &t->blur, scale, at);
+            double finite = (score(t, scale, at + 1e-4) - score(t, scale, at - 1e-4)) / 2e-4;
+            assert_true(fabs(slope - finite) < 1e-5 + 1e-4 * fabs(finite));
+        }
+        for (double at = 0; at <= GSDI_BLUR_MOST; at += 0.001)
+            best = score(t, scale, at) > score(t, scale, best) ? at : best;
+        double step = GSDI_BLUR_MOST / (1 << GSDI_BLUR_STEPS), half = 2 * got / (1 + got);
+        if (!(half <= best + 0.001 && best <= half + step + 0.001))
+            fail_msg("seed %d: moved %g, best %g", (int)seed, half, best);
+        moved += got > 0;
+        still += got == 0;
+        free(t);
+    }
+    assert_true(moved > 10 && still > 5);
+}
+
+static void assert_sane(const tree *t, double total, double strength)
+{
+    double sum = 0;
+    assert_true(strength >= 0 && strength <= GSDI_BLUR_MOST / (2 - GSDI_BLUR_MOST));
+    for (uint32_t i = 0; i < t->count; ++i) {
+        assert_true(t->mass[i] >= 0 && t->mass[i] <= 1.0001 * total);
+        sum += t->child[i] ? 0 : t->mass[i];
+    }
+    assert_true(fabs(sum - total) <= 1e-6 * total);
+    assert_true(fabs(t->mass[0] - total) <= 1e-6 * total);
+}
+
+static void test_hostile_trees_keep_their_mass(void **state)
+{
+    (void)state;
+    int moved = 0;
+    for (uint32_t deepest = 1; deepest <= 20; ++deepest)
+        for (int kind = 0; kind < 6; ++kind)
+            for (int second = 0; second < 2; ++second) {
+                tree *t = make_tree(deepest * 10 + (uint32_t)kind, deepest, kind == 0 || deepest > 7 ? -1 : 0.6);
+                uint32_t hot = t->count - 1;
+                for (uint32_t i = 0; i < t->count; ++i)
+                    for (int k = 0; k < 2; ++k) {
+                        double *x = &t->sum[i].half[k];
+                        if (kind == 1) /* one hot leaf */
+                            *x = i == hot ? 1e30 : 0;
+                        else if (kind == 2) /* contrast 1e60, halves unlike each other */
+                            *x = pow(10, 60 * rnd() - 30);
+                        else if (kind == 3) /* one half empty */
+                            *x = k ? 0 : *x;
+                        else if (kind == 4) /* one leaf of a half, another of the other */
+                            *x = i == (k ? hot : hot - 1) ? 1e-30 : 0;
+                        else if (kind == 5) /* as large as sums can be */
+                            *x *= 1e290;
+                    }
+                measure(t, second);
+                double total = t->mass[0];
+                double strength = gsdi_blur_tree(t->child, t->sum, t->depth, t->count, second, &t->blur);
+                assert_sane(t, total, strength);
+                if (kind == 3)
+                    assert_true(strength == 0);
+                moved += strength > 0;
+                free(t);
+            }
+    assert_true(moved > 20);
+}
+
+static void test_even_trees_stay_even(void **state)
+{
+    (void)state;
+    for (uint64_t seed = 1; seed < 20; ++seed) {
+        tree *t = make_tree(seed, 6, 0.7);
+        for (int pass = 0; pass < 2; ++pass) {
+            measure(t, false);
+            for (uint32_t i = 0; i < t->count; ++i)
+                for (int k = 0; k < 2; ++k)
+                    t->sum[i].half[k] = pow(0.25, t->depth[i]);
+        }
+        double strength = gsdi_blur_tree(t->child, t->sum, t->depth, t->count, false, &t->blur);
+        assert_sane(t, 2, strength);
+        for (uint32_t i = 0; i < t->count; ++i)
+            assert_true(fabs(t->mass[i] - 2 * pow(0.25, t->depth[i])) <= 1e-6 * t->mass[i]);
+        free(t);
+    }
+}
+
+/* ---- in a field */
+
+/* Radiance of a test field: 0 broad lobe, 1 two small lamps, 2 a grating, 3 even. */
+static double light(int kind, const float d[3])
+{
+    double z = (double)d[2], x = (double)d[0], y = (double)d[1];
+    switch (kind) {
+    case 0:
+        return 0.05 + exp(6 * (0.6 * x + 0.8 * z - 1));
+    case 1:
+        return 0.01 + 300 * (z > 0.995) + 100 * (0.8 * y + 0.6 * x > 0.99);
+    case 2:
+        return 1 + 0.99 * sin(12 * atan2(y, x)) * sin(9 * z);
+    default:
+        return 1;
+    }
+}
+
+/* Learn from 8 passes of n samples each, directions from the field itself. Returns the chi-square distance of the
+   learned density p to the light L: integral of L^2 / p over (integral of L)^2 (1 is perfect). */
+static double trained(int kind, int n, gsd_target target, bool denoise, uint64_t seed, gsd_stats *stats)
+{
+    gsd_desc d;
+    gsd_field *f;
+    gsd_stream *s;
+    memset(&d, 0, sizeof d);
+    d.bounds_max[0] = d.bounds_max[1] = d.bounds_max[2] = 1;
+    d.target = target;
+    d.split_samples = 1e9f;
+    d.no_denoise = !denoise;
+    d.no_gate = true;
+    OK(gsd_create(&d, &f));
+    OK(gsd_stream_create(f, &s));
+    rng_state = seed;
+    float at[3] = {0.5f, 0.5f, 0.5f}, w[3];
+    for (int pass = 0; pass < 8; ++pass) {
+        gsd_view v = gsd_get_view(f);
+        gsd_handle h = gsd_find(&v, at, NULL, NULL);
+        for (int i = 0; i < n; ++i) {
+            float u[2] = {(float)rnd() * 0.999999f, (float)rnd() * 0.999999f}, p = gsd_sample(&v, &h, u, w), mix;
+            if (rnd() < 0.5) { /* half of them anywhere */
+                gsd_direction(rnd() * 16777216, rnd() * 16777216, w);
+                p = gsd_pdf(&v, &h, w);
+            }
+            mix = 0.5f * (p + GSD_INV_4PI);
+            float L = (float)(light(kind, w) * -log(1 - rnd()));
+            gsd_training_sample sample = gsd_make_scalar_sample(at, w, NULL, L, L, L, mix, GSD_INV_4PI, p);
+            OK(gsd_record(s, &sample, 1));
+        }
+        OK(gsd_accumulate(f, &s, 1, NULL, NULL));
+        gsd_stream_clear(s);
+        OK(gsd_refine(f, NULL, NULL, NULL));
+        OK(gsd_validate(f));
+    }
+    gsd_view v = gsd_get_view(f);
+    gsd_handle h = gsd_find(&v, at, NULL, NULL);
+    double sum = 0, square = 0;
+    for (int j = 0; j < 400; ++j)
+        for (int i = 0; i < 400; ++i) {
+            gsd_direction((i + 0.5) / 400 * 16777216, (j + 0.5) / 400 * 16777216, w);
+            double L = light(kind, w), p = (double)gsd_pdf(&v, &h, w);
+            sum += L / 160000;
+            square += L * L / (p * 4 * PI) / 160000;
+        }
+    gsd_get_stats(f, stats);
+    gsd_stream_destroy(s);
+    gsd_destroy(f);
+    return square / (sum * sum);
+}
+
+/* The gain where samples are few, and no loss where light has edges, is even or well known. */
+static void test_denoising_pays(void **state)
+{
+    (void)state;
+    static const struct {
+        int kind, n;
+        gsd_target target;
+        double most; /* of (V - 1) on over off, mean of the seeds */
+    } cases[] = {{0, 200, GSD_TARGET_RADIANCE, 0.9},    {0, 200, GSD_TARGET_SIMPLE, 0.9},
+                 {0, 20000, GSD_TARGET_RADIANCE, 1.02}, {1, 400, GSD_TARGET_RADIANCE, 1.05},
+                 {1, 20000, GSD_TARGET_RADIANCE, 1.02}, {1, 20000, GSD_TARGET_SIMPLE, 1.02},
+                 {2, 300, GSD_TARGET_RADIANCE, 1.02},   {2, 20000, GSD_TARGET_RADIANCE, 1.02},
+                 {3, 300, GSD_TARGET_RADIANCE, 0.8}};
+    for (size_t c = 0; c < sizeof cases / sizeof *cases; ++c) {
+        double on = 0, off = 0;
+        int seeds = cases[c].n > 1000 ? 3 : 12;
+        gsd_stats stats;
+        for (int seed = 1; seed <= seeds; ++seed) {
+            off += trained(cases[c].kind, cases[c].n, cases[c].target, false, (uint64_t)seed, &stats) - 1;
+            assert_true(stats.denoised_trees == 0 && stats.mean_blur == 0);
+            on += trained(cases[c].kind, cases[c].n, cases[c].target, true, (uint64_t)seed, &stats) - 1;
+            assert_true(stats.denoised_trees <= stats.rebuilt_trees && stats.mean_blur >= 0);
+        }
+        print_message("light %d, %d samples, target %d: V - 1 %.4f with, %.4f without: %.3f\n", cases[c].kind,
+                      cases[c].n, cases[c].target, on / seeds, off / seeds, on / off);
+        assert_true(on <= cases[c].most * off);
+    }
+}
+
+/* A plain parallel_for that runs its ranges backwards, in other pieces than asked for. */
+static void backwards(void *user, uint32_t count, uint32_t grain, gsd_range_fn fn, void *context)
+{
+    uint32_t piece = *(uint32_t *)user * grain;
+    for (uint32_t end = count; end;) {
+        uint32_t begin = end > piece ? end - piece : 0;
+        fn(context, begin, end);
+        end = begin;
+    }
+}
+
+typedef struct piece {
+    gsd_range_fn fn;
+    void *context;
+    uint32_t begin, end;
+} piece;
+
+static void *run_piece(void *p)
+{
+    piece *q = p;
+    q->fn(q->context, q->begin, q->end);
+    return NULL;
+}
+
+static void threads(void *user, uint32_t count, uint32_t grain, gsd_range_fn fn, void *context)
+{
+    enum { N = 4 };
+    pthread_t id[N];
+    piece p[N];
+    (void)user;
+    (void)grain;
+    for (uint32_t i = 0; i < N; ++i) {
+        p[i] = (piece){fn, context, (uint32_t)((uint64_t)count * i / N), (uint32_t)((uint64_t)count * (i + 1) / N)};
+        assert_int_equal(pthread_create(&id[i], NULL, run_piece, &p[i]), 0);
+    }
+    for (uint32_t i = 0; i < N; ++i)
+        pthread_join(id[i], NULL);
+}
+
+static size_t learn_box(gsd_parallel_fn parallel, void *user, unsigned char **data)
+{
+    gsd_desc d;
+    gsd_field *f;
+    gsd_stream *s;
+    memset(&d, 0, sizeof d);
+    d.bounds_max[0] = d.bounds_max[1] = d.bounds_max[2] = 1;
+    OK(gsd_create(&d, &f));
+    OK(gsd_stream_create(f, &s));
+    rng_state = 5;
+    for (int pass = 0; pass < 5; ++pass) {
+        for (int i = 0; i < 6000; ++i) {
+            float at[3] = {(float)rnd(), (float)rnd(), (float)rnd()}, w[3];
+            gsd_direction(rnd() * 16777216, rnd() * 16777216, w);
+            float L = (float)(light(i % 2, w) * rnd());
+            gsd_training_sample sample = gsd_make_scalar_sample(at, w, NULL, L, L, L, GSD_INV_4PI, GSD_INV_4PI, 0);
+            OK(gsd_record(s, &sample, 1));
+        }
+        OK(gsd_accumulate(f, &s, 1, parallel, user));
+        gsd_stream_clear(s);
+        OK(gsd_refine(f, NULL, parallel, user));
+    }
+    gsd_stats stats;
+    gsd_get_stats(f, &stats);
+    assert_true(stats.cells > 20 && stats.denoised_trees > stats.cells / 4 && stats.mean_blur > 0.02f);
+    size_t size = gsd_save_bound(f);
+    *data = malloc(size);
+    OK(gsd_save(f, *data, size, &size));
+    gsd_stream_destroy(s);
+    gsd_destroy(f);
+    return size;
+}
+
+static void test_any_threads_give_the_same_field(void **state)
+{
+    (void)state;
+    unsigned char *serial, *other;
+    size_t size = learn_box(NULL, NULL, &serial);
+    for (uint32_t pieces = 1; pieces <= 3; ++pieces) {
+        assert_int_equal(learn_box(pieces == 3 ? threads : backwards, &pieces, &other), size);
+        assert_memory_equal(serial, other, size);
+        free(other);
+    }
+    free(serial);
+}
+
+int main(void)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(test_surroundings_match_matrices),
+        cmocka_unit_test(test_strength_is_where_the_halves_agree_best),
+        cmocka_unit_test(test_hostile_trees_keep_their_mass),
+        cmocka_unit_test(test_even_trees_stay_even),
+        cmocka_unit_test(test_denoising_pays),
+        cmocka_unit_test(test_any_threads_give_the_same_field),
+    };
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}
