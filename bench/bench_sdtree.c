@@ -574,6 +574,7 @@ static void validate_learning(const options *o)
     gsd_desc desc = o->desc;
     naive_learner naive = naive_create(1e9, 0.01);
     static const float middle[3] = {0.5f, 0.5f, 0.5f};
+    desc.no_denoise = true; /* bench_denoise checks that */
     desc.target = GSD_TARGET_RADIANCE;
     desc.split_samples = 1e9f;
     desc.rho = 0.01f;
@@ -648,6 +649,112 @@ static void bench_learning(const options *o, const machine *m)
     naive_free_space(naive.root);
 }
 
+/* ---- denoising ---------------------------------------------------------------------------------------------- */
+
+/* Building trees of a learned field, with new samples in them: what refine denoises. */
+typedef struct trees {
+    gsd_field *field;
+    double *mass, *work; /* [nodes] */
+    unsigned char *depth;
+    float *blur; /* [5 nodes] */
+    uint64_t leaves;
+} trees;
+
+static trees make_trees(int log2n)
+{
+    trees t = {NULL, NULL, NULL, NULL, NULL, 0};
+    learning time;
+    gsd_desc desc;
+    gsd_stream *stream;
+    sf1_rng rng = {77};
+    uint32_t n = (1u << log2n) / SF1_UPDATES;
+    memset(&desc, 0, sizeof desc);
+    desc.bounds_max[0] = desc.bounds_max[1] = desc.bounds_max[2] = 1;
+    desc.target = GSD_TARGET_RADIANCE;
+    t.field = learn(&desc, log2n, 5, &time, NULL, NULL);
+    gsd_training_sample *samples = allocate(n, sizeof *samples);
+    check(gsd_stream_create(t.field, &stream), "stream");
+    check(gsd_record(stream, samples, draw_samples(&rng, n, 7, 0, samples)), "record");
+    check(gsd_accumulate(t.field, &stream, 1, NULL, NULL), "accumulate");
+    gsd_stream_destroy(stream);
+    free(samples);
+    uint32_t nodes = t.field->building_nodes;
+    t.mass = allocate(nodes, sizeof *t.mass);
+    t.work = allocate(nodes, sizeof *t.work);
+    t.depth = allocate(nodes, 1);
+    t.blur = allocate(nodes, GSDI_BLUR_BYTES);
+    for (uint32_t c = 0; c < gsd_cell_count(t.field); ++c) {
+        const gsdi_state *s = &t.field->states[c];
+        gsdi_tree_masses(t.field->child + s->first, t.field->sum + s->first, s->count, false, t.mass + s->first,
+                         t.depth + s->first);
+        t.leaves += (s->count - 1) / 4 * 3 + 1;
+    }
+    return t;
+}
+
+static void free_trees(trees *t)
+{
+    free(t->mass);
+    free(t->work);
+    free(t->depth);
+    free(t->blur);
+    gsd_destroy(t->field);
+}
+
+/* Denoise the tree of cell c; the masses are in t->work afterwards. */
+static double denoise(const trees *t, uint32_t c)
+{
+    const gsdi_state *s = &t->field->states[c];
+    gsdi_blur b;
+    for (int k = 0; k < 5; ++k)
+        *(k < 2 ? &b.half[k] : &b.near[k - 2]) = t->blur + 5 * (size_t)s->first + (size_t)k * s->count;
+    b.mass = t->work + s->first;
+    memcpy(b.mass, t->mass + s->first, s->count * sizeof *b.mass);
+    if (s->count < 5 || !(b.mass[0] > 0))
+        return 0;
+    return gsdi_blur_tree(t->field->child + s->first, t->field->sum + s->first, t->depth + s->first, s->count, false,
+                          &b);
+}
+
+static void bench_denoise(const options *o, const machine *m)
+{
+    trees t = make_trees(18);
+    uint32_t cells = gsd_cell_count(t.field), blurred = 0;
+    double naive = 1e300, worst = 0, apart = 0;
+    for (int i = 0; i < 3; ++i) {
+        double start = bench_seconds();
+        for (uint32_t c = 0; c < cells; ++c) {
+            const gsdi_state *s = &t.field->states[c];
+            naive_blur blur = naive_denoise(t.field->child + s->first, t.field->sum + s->first, s->count);
+            if (i == 0 && s->count >= 5 && t.mass[s->first] > 0) { /* check */
+                double strength = denoise(&t, c);
+                apart = fmax(apart, fabs(strength - blur.strength));
+                blurred += strength > 0;
+                for (uint32_t k = 0; k < s->count; ++k) { /* at the strength that was found */
+                    double mass = t.mass[s->first + k], to = mass + strength * (blur.near[k] - mass);
+                    if (!t.field->child[s->first + k])
+                        worst = fmax(worst, fabs(t.work[s->first + k] - to) / (to + 1e-9 * t.mass[s->first]));
+                }
+            }
+            free(blur.near);
+        }
+        naive = fmin(naive, bench_seconds() - start);
+    }
+    printf(
+        "\ndenoising %u trees of %.0f leaves, %u of them blurred; checked: masses within %.1e, strength within %.3f\n",
+        cells, (double)t.leaves / cells, blurred, worst, apart);
+    if (worst > 1e-5 || apart > 0.04) /* both look in steps */
+        fail("denoising does not agree with the naive one");
+    bench_time time;
+    BENCH_TIME(time, o->repeats, t.leaves, {
+        for (uint32_t c = 0; c < cells; ++c)
+            denoise(&t, c);
+    });
+    row_titles("ns per leaf");
+    row("denoise", time, 8 * m->cached, naive * 1e9 / (double)t.leaves, 170);
+    free_trees(&t);
+}
+
 static void run_micro(const options *o)
 {
     gsd_stats stats;
@@ -672,6 +779,7 @@ static void run_micro(const options *o)
     gsd_destroy(field);
     gsd_destroy(alias_field);
     bench_learning(o, &m);
+    bench_denoise(o, &m);
 }
 
 /* ---- command line ------------------------------------------------------------------------------------------- */

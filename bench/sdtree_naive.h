@@ -3,7 +3,8 @@
 
      >>tree     quadtree over (z, phi): pdf, sample
      >>space    binary tree over the cube, copied out of a gsd_field
-     >>learn    the whole method: record, refine */
+     >>learn    the whole method: record, refine
+     >>denoise  surroundings of leaves by walks from the root; strength by trying out */
 #ifndef SDTREE_NAIVE_H
 #define SDTREE_NAIVE_H
 
@@ -290,6 +291,96 @@ static inline void naive_refine(naive_learner *l)
 {
     naive_split(l->root, l->split_samples);
     naive_rebuild_leaves(l->root, l);
+}
+
+/* ---- >>denoise ---------------------------------------------------------------------------------------------- */
+
+/* Mass of the square (x, y) of 2^depth x 2^depth: of a node, a share of a leaf's by area, or the sum of a subtree. */
+static inline double naive_square(const uint32_t *child, const double *mass, long x, long y, uint32_t depth)
+{
+    long n = 1l << depth;
+    uint32_t node = 0, left = depth;
+    if (y < 0 || y >= n) { /* past a pole */
+        y = y < 0 ? -1 - y : 2 * n - 1 - y;
+        x += n / 2;
+    }
+    x &= n - 1;
+    while (left && child[node]) {
+        --left;
+        node = child[node] + (uint32_t)((x >> left) & 1) + 2 * (uint32_t)((y >> left) & 1);
+    }
+    return mass[node] / (double)(1ull << (2 * left));
+}
+
+static inline double naive_around(const uint32_t *child, const double *mass, long x, long y, uint32_t depth)
+{
+    double sum = 0;
+    for (long j = -1; j <= 1; ++j)
+        for (long i = -1; i <= 1; ++i)
+            if (i || j)
+                sum += (i && j ? 1 : 2) / 12.0 * naive_square(child, mass, x + i, y + j, depth);
+    return sum;
+}
+
+typedef struct naive_blur {
+    double strength;
+    double *near; /* [nodes], leaves: the mass of their surroundings; the caller frees it */
+} naive_blur;
+
+/* gsdi_blur_tree for the radiance target, plainly: the strength is the best of many. */
+static inline naive_blur naive_denoise(const uint32_t *child, const gsdi_sum *sum, uint32_t count)
+{
+    naive_blur out = {0, NULL};
+    double *mass[3], *near[3], best = -1e300, near_total[3] = {0, 0, 0};
+    long *x = calloc(count, sizeof *x), *y = calloc(count, sizeof *y);
+    uint32_t *depth = calloc(count, sizeof *depth);
+    for (int h = 0; h < 3; ++h) {
+        mass[h] = calloc(count, sizeof(double));
+        near[h] = calloc(count, sizeof(double));
+        if (!x || !y || !depth || !mass[h] || !near[h])
+            abort();
+        for (uint32_t i = count; i-- > 0;) {
+            const double *below = mass[h] + child[i];
+            mass[h][i] = child[i] ? below[0] + below[1] + below[2] + below[3]
+                         : h < 2  ? sum[i].half[h]
+                                  : sum[i].half[0] + sum[i].half[1];
+        }
+    }
+    for (uint32_t i = 0; i < count; ++i)
+        for (uint32_t k = 0; k < 4 && child[i]; ++k) {
+            x[child[i] + k] = 2 * x[i] + (k & 1);
+            y[child[i] + k] = 2 * y[i] + (k >> 1);
+            depth[child[i] + k] = depth[i] + 1;
+        }
+    for (int h = 0; h < 3; ++h)
+        for (uint32_t i = 0; i < count; ++i)
+            if (!child[i])
+                near_total[h] += near[h][i] = naive_around(child, mass[h], x[i], y[i], depth[i]);
+    for (int step = 0; step <= 24 && mass[0][0] > 0 && mass[1][0] > 0; ++step) {
+        double t = GSDI_BLUR_MOST * step / 24, score = 0;
+        for (uint32_t i = 0; i < count; ++i)
+            for (int h = 0; h < 2 && !child[i]; ++h)
+                score +=
+                    mass[1 - h][i] / mass[1 - h][0] *
+                    log((1 - GSDI_BLUR_EVEN) * ((1 - t) * mass[h][i] / mass[h][0] + t * near[h][i] / near_total[h]) +
+                        GSDI_BLUR_EVEN * pow(0.25, depth[i]));
+        if (score > best) {
+            best = score;
+            out.strength = t / (2 - t);
+        }
+    }
+    for (uint32_t i = 0; i < count; ++i)
+        near[2][i] *= near_total[2] > 0 ? mass[2][0] / near_total[2] : 0;
+    out.near = near[2];
+    for (int h = 0; h < 3; ++h) {
+        free(mass[h]);
+        if (h < 2)
+            free(near[h]);
+    }
+    free(x);
+    free(y);
+    free(depth);
+    return out;
 }
 
 #endif
