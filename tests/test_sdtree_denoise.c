@@ -124,7 +124,7 @@ static void test_surroundings_match_matrices(void **state)
     (void)state;
     for (uint64_t seed = 1; seed <= 60; ++seed) {
         bool second = seed & 1;
-        tree *t = make_tree(seed, 1 + seed % 8, seed % 5 == 0 ? -1 : 0.7);
+        tree *t = make_tree(seed, 1 + seed % 6, seed % 5 == 0 ? -1 : 0.7);
         double own[MOST], sum[2] = {0, 0};
         measure(t, second);
         for (uint32_t h = 0; h < 2; ++h)
@@ -164,7 +164,7 @@ static void test_strength_is_where_the_halves_agree_best(void **state)
 {
     (void)state;
     int moved = 0, still = 0;
-    for (uint64_t seed = 1; seed <= 60; ++seed) {
+    for (uint64_t seed = 1; seed <= 30; ++seed) {
         bool second = seed & 1;
         tree *t = make_tree(seed, 3 + seed % 4, 0.8);
         for (uint32_t i = 0; i < t->count; ++i) /* from equal halves to independent ones */
@@ -184,16 +184,16 @@ static void test_strength_is_where_the_halves_agree_best(void **state)
             double finite = (score(t, scale, at + 1e-4) - score(t, scale, at - 1e-4)) / 2e-4;
             assert_true(fabs(slope - finite) < 1e-5 + 1e-4 * fabs(finite));
         }
-        for (double at = 0; at <= GSDI_BLUR_MOST; at += 0.001)
+        for (double at = 0; at <= GSDI_BLUR_MOST; at += 0.006)
             best = score(t, scale, at) > score(t, scale, best) ? at : best;
         double step = GSDI_BLUR_MOST / (1 << GSDI_BLUR_STEPS), half = 2 * got / (1 + got);
-        if (!(half <= best + 0.001 && best <= half + step + 0.001))
+        if (!(half <= best + 0.006 && best <= half + step + 0.006))
             fail_msg("seed %d: moved %g, best %g", (int)seed, half, best);
         moved += got > 0;
         still += got == 0;
         free(t);
     }
-    assert_true(moved > 10 && still > 5);
+    assert_true(moved > 5 && still > 3);
 }
 
 static void assert_sane(const tree *t, double total, double strength)
