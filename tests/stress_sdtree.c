@@ -743,7 +743,8 @@ typedef struct snapshot {
 static void settle(gsd_field *f)
 {
     for (uint32_t i = 0; i < f->building_nodes; ++i)
-        f->sum[i] = f->child[i] ? 0 : f->sum[i];
+        if (f->child[i])
+            memset(&f->sum[i], 0, sizeof f->sum[i]);
 }
 
 static snapshot look(stress *s, const world *w, int i)
