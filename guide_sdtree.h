@@ -39,8 +39,7 @@
      >>field     create, refine, stats         >>store   save, load, merge, export, import
      implementation:
      >>memory  >>math  >>streams  >>trees  >>denoise  >>accumulate  >>gate  >>block  >>refine  >>life  >>forest
-   >>batches
-     >>files  >>check  >>plain  >>licence
+     >>batches  >>files  >>check  >>plain  >>licence
 
    HOW IT WORKS
      Space is a binary tree over a cube: axes in turn, cut in the middle. A leaf (*cell*) splits when it holds more than
@@ -1399,7 +1398,18 @@ typedef struct gsdi_blur {
     float *near[3]; /* leaves: mean of the eight squares around, of each half and of both */
     double *mass;   /* of both halves, all nodes, not divided by their sum */
 } gsdi_blur;
-#define GSDI_BLUR_BYTES (5 * sizeof(float)) /* a node */
+#define GSDI_BLUR_FLOATS 5 /* a node */
+
+/* Cut `work` [GSDI_BLUR_FLOATS * nodes] into the parts of a blur. */
+static gsdi_blur gsdi_blur_make(float *work, uint32_t nodes, double *mass)
+{
+    gsdi_blur b;
+    uint32_t k;
+    for (k = 0; k < GSDI_BLUR_FLOATS; ++k)
+        *(k < 2 ? &b.half[k] : &b.near[k - 2]) = work + (size_t)k * nodes;
+    b.mass = mass;
+    return b;
+}
 
 /* A node with the 3 x 3 squares of its size around it: `near` is a node of that size, or the leaf that lies `up` levels
    above. Row by row, upwards in z. */
@@ -2377,7 +2387,7 @@ typedef struct gsdi_refinement {
     gsdi_job *jobs;       /* [old cells] */
     double *mass;         /* [building nodes] */
     unsigned char *depth; /* [building nodes] */
-    float *blur;          /* [5 * building nodes] */
+    float *blur;          /* [GSDI_BLUR_FLOATS * building nodes], while denoising */
     gsdi_place *places;   /* [cells] */
     uint32_t cells, cell_limit, place_capacity;
     uint32_t *spatial; /* [spatial_count] */
@@ -2400,7 +2410,6 @@ static void gsdi_refinement_free(gsdi_refinement *r)
     gsdi_release(r->desc, r->jobs);
     gsdi_release(r->desc, r->mass);
     gsdi_release(r->desc, r->depth);
-    gsdi_release(r->desc, r->blur);
     gsdi_release(r->desc, r->places);
     gsdi_release(r->desc, r->spatial);
     gsdi_release(r->desc, r->trees);
@@ -2436,24 +2445,44 @@ static void gsdi_measure(void *context, uint32_t begin, uint32_t end)
     }
 }
 
-/* Denoise the masses of the old cells' building trees. */
-static void gsdi_denoise(void *context, uint32_t begin, uint32_t end)
+static void gsdi_denoise_range(void *context, uint32_t begin, uint32_t end)
 {
     gsdi_refinement *r = (gsdi_refinement *)context;
-    uint32_t c, k;
+    uint32_t c;
     for (c = begin; c < end; ++c) {
         const gsdi_state *s = &r->field->states[c];
         gsdi_job *job = &r->jobs[c];
         gsdi_blur b;
         if (!job->rebuild || s->count < 5)
             continue;
-        for (k = 0; k < 5; ++k)
-            *(k < 2 ? &b.half[k] : &b.near[k - 2]) = r->blur + 5 * (size_t)s->first + (size_t)k * s->count;
-        b.mass = r->mass + s->first;
+        b = gsdi_blur_make(r->blur + GSDI_BLUR_FLOATS * (size_t)s->first, s->count, r->mass + s->first);
         job->blur = gsdi_blur_tree(r->field->child + s->first, r->field->sum + s->first, r->depth + s->first, s->count,
                                    r->second_moment, &b);
         job->limit_mass = b.mass[0];
     }
+}
+
+/* Denoise the masses of the old cells' building trees. False = out of memory. */
+static bool gsdi_denoise(gsdi_refinement *r, gsd_parallel_fn parallel, void *user)
+{
+    uint32_t cells = r->field->block->cells, i;
+    double blur = 0;
+    r->stats.denoised_trees = 0;
+    r->stats.mean_blur = 0;
+    if (r->desc->no_denoise)
+        return true;
+    r->blur = (float *)gsdi_allocate(r->desc, r->field->building_nodes, GSDI_BLUR_FLOATS * sizeof(float));
+    if (!r->blur)
+        return false;
+    gsdi_run(parallel, user, cells, 16, gsdi_denoise_range, r);
+    gsdi_release(r->desc, r->blur);
+    for (i = 0; i < cells; ++i) {
+        r->stats.denoised_trees += r->jobs[i].blur > 0;
+        blur += r->jobs[i].blur;
+    }
+    if (r->stats.rebuilt_trees)
+        r->stats.mean_blur = (float)(blur / r->stats.rebuilt_trees);
+    return true;
 }
 
 /* Sizes of the next building trees at the present rho. */
@@ -2613,9 +2642,9 @@ static uint64_t gsdi_refine_scratch(const gsdi_block *old, uint64_t nodes, uint6
 static uint64_t gsdi_refine_peak(const gsdi_refinement *r, const gsdi_block *block, uint64_t nodes)
 {
     const gsd_field *f = r->field;
-    uint64_t next = gsdi_bytes(block, nodes), blur = r->desc->no_denoise ? 0 : f->building_nodes * GSDI_BLUR_BYTES;
+    uint64_t next = gsdi_bytes(block, nodes), blur = f->building_nodes * (uint64_t)GSDI_BLUR_FLOATS * sizeof(float);
     return gsdi_bytes(f->block, f->node_capacity) + (f->state_capacity - f->block->cells) * sizeof(gsdi_state) +
-           (next > blur ? next : blur) +
+           (next > blur || r->desc->no_denoise ? next : blur) +
            gsdi_refine_scratch(f->block, f->building_nodes, r->place_capacity, r->spatial_capacity);
 }
 
@@ -2805,28 +2834,21 @@ static uint32_t gsdi_refine_plan(gsdi_refinement *r, gsd_parallel_fn parallel, v
     gsd_field *field = r->field;
     uint32_t old = field->block->cells, i;
     uint64_t total;
-    double blur = 0;
     bool fits;
     r->jobs = (gsdi_job *)gsdi_allocate(r->desc, old, sizeof *r->jobs);
     r->mass = (double *)gsdi_allocate(r->desc, field->building_nodes, sizeof(double));
     r->depth = (unsigned char *)gsdi_allocate(r->desc, field->building_nodes, 1);
-    r->blur = (float *)gsdi_allocate(r->desc, r->desc->no_denoise ? 1 : field->building_nodes, GSDI_BLUR_BYTES);
-    if (!r->jobs || !r->mass || !r->depth || !r->blur)
+    if (!r->jobs || !r->mass || !r->depth)
         return 0;
     gsdi_run(parallel, user, old, 16, gsdi_measure, r);
-    if (!r->desc->no_denoise)
-        gsdi_run(parallel, user, old, 16, gsdi_denoise, r);
-    gsdi_release(r->desc, r->blur);
-    r->blur = NULL;
     for (i = 0; i < old; ++i) {
         const gsdi_state *s = &field->states[i];
         r->stats.rebuilt_trees += r->jobs[i].rebuild;
-        r->stats.denoised_trees += r->jobs[i].blur > 0;
-        blur += r->jobs[i].blur;
         r->stats.waiting_cells += !r->jobs[i].rebuild && s->fresh > 0;
         r->stats.unread_cells += !(s->fresh > 0);
     }
-    r->stats.mean_blur = r->stats.rebuilt_trees ? (float)(blur / r->stats.rebuilt_trees) : 0;
+    if (!gsdi_denoise(r, parallel, user))
+        return 0;
     r->shape = *field->block;
     r->cell_limit = gsdi_cell_limit(r->desc);
     r->needs = (gsdi_need *)gsdi_allocate(r->desc, (uint64_t)old + 1, sizeof *r->needs);
@@ -2941,7 +2963,6 @@ GSD_API gsd_result gsd_refine(gsd_field *field, const gsd_pass *pass, gsd_parall
     r.desc = &field->desc;
     r.stats = field->stats;
     r.stats.split_cells = r.stats.rebuilt_trees = r.stats.waiting_cells = r.stats.unread_cells = 0;
-    r.stats.denoised_trees = 0;
     r.second_moment = field->target != GSD_TARGET_RADIANCE;
     for (i = 0; i < field->block->cells; ++i)
         samples += field->states[i].fresh;

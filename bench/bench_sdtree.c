@@ -574,7 +574,7 @@ static void validate_learning(const options *o)
     gsd_desc desc = o->desc;
     naive_learner naive = naive_create(1e9, 0.01);
     static const float middle[3] = {0.5f, 0.5f, 0.5f};
-    desc.no_denoise = true; /* bench_denoise checks that */
+    desc.no_denoise = true; /* validate_denoise checks that */
     desc.target = GSD_TARGET_RADIANCE;
     desc.split_samples = 1e9f;
     desc.rho = 0.01f;
@@ -656,7 +656,7 @@ typedef struct trees {
     gsd_field *field;
     double *mass, *work; /* [nodes] */
     unsigned char *depth;
-    float *blur; /* [5 nodes] */
+    float *blur; /* [GSDI_BLUR_FLOATS * nodes] */
     uint64_t leaves;
 } trees;
 
@@ -682,7 +682,7 @@ static trees make_trees(int log2n)
     t.mass = allocate(nodes, sizeof *t.mass);
     t.work = allocate(nodes, sizeof *t.work);
     t.depth = allocate(nodes, 1);
-    t.blur = allocate(nodes, GSDI_BLUR_BYTES);
+    t.blur = allocate(nodes, GSDI_BLUR_FLOATS * sizeof *t.blur);
     for (uint32_t c = 0; c < gsd_cell_count(t.field); ++c) {
         const gsdi_state *s = &t.field->states[c];
         gsdi_tree_masses(t.field->child + s->first, t.field->sum + s->first, s->count, false, t.mass + s->first,
@@ -705,10 +705,7 @@ static void free_trees(trees *t)
 static double denoise(const trees *t, uint32_t c)
 {
     const gsdi_state *s = &t->field->states[c];
-    gsdi_blur b;
-    for (int k = 0; k < 5; ++k)
-        *(k < 2 ? &b.half[k] : &b.near[k - 2]) = t->blur + 5 * (size_t)s->first + (size_t)k * s->count;
-    b.mass = t->work + s->first;
+    gsdi_blur b = gsdi_blur_make(t->blur + GSDI_BLUR_FLOATS * (size_t)s->first, s->count, t->work + s->first);
     memcpy(b.mass, t->mass + s->first, s->count * sizeof *b.mass);
     if (s->count < 5 || !(b.mass[0] > 0))
         return 0;
@@ -716,42 +713,54 @@ static double denoise(const trees *t, uint32_t c)
                           &b);
 }
 
-static void bench_denoise(const options *o, const machine *m)
+static naive_blur denoise_naively(const trees *t, uint32_t c)
 {
-    trees t = make_trees(18);
-    uint32_t cells = gsd_cell_count(t.field), blurred = 0;
-    double naive = 1e300, worst = 0, apart = 0;
-    for (int i = 0; i < 3; ++i) {
-        double start = bench_seconds();
-        for (uint32_t c = 0; c < cells; ++c) {
-            const gsdi_state *s = &t.field->states[c];
-            naive_blur blur = naive_denoise(t.field->child + s->first, t.field->sum + s->first, s->count);
-            if (i == 0 && s->count >= 5 && t.mass[s->first] > 0) { /* check */
-                double strength = denoise(&t, c);
-                apart = fmax(apart, fabs(strength - blur.strength));
-                blurred += strength > 0;
-                for (uint32_t k = 0; k < s->count; ++k) { /* at the strength that was found */
-                    double mass = t.mass[s->first + k], to = mass + strength * (blur.near[k] - mass);
-                    if (!t.field->child[s->first + k])
-                        worst = fmax(worst, fabs(t.work[s->first + k] - to) / (to + 1e-9 * t.mass[s->first]));
-                }
-            }
-            free(blur.near);
+    const gsdi_state *s = &t->field->states[c];
+    return naive_denoise(t->field->child + s->first, t->field->sum + s->first, s->count);
+}
+
+/* Masses at the strength that was found, and that strength, against the naive ones. */
+static void validate_denoise(const trees *t, uint32_t cells)
+{
+    uint32_t blurred = 0;
+    double worst = 0, apart = 0;
+    for (uint32_t c = 0; c < cells; ++c) {
+        const gsdi_state *s = &t->field->states[c];
+        const double *mass = t->mass + s->first;
+        double strength = denoise(t, c);
+        naive_blur naive = denoise_naively(t, c);
+        apart = fmax(apart, fabs(strength - naive.strength));
+        blurred += strength > 0;
+        for (uint32_t k = 0; k < s->count; ++k) {
+            double to = mass[k] + strength * (naive.near[k] - mass[k]), got = t->work[s->first + k];
+            if (!t->field->child[s->first + k] && mass[0] > 0)
+                worst = fmax(worst, fabs(got - to) / (to + 1e-9 * mass[0]));
         }
-        naive = fmin(naive, bench_seconds() - start);
+        free(naive.near);
     }
     printf(
         "\ndenoising %u trees of %.0f leaves, %u of them blurred; checked: masses within %.1e, strength within %.3f\n",
-        cells, (double)t.leaves / cells, blurred, worst, apart);
+        cells, (double)t->leaves / cells, blurred, worst, apart);
     if (worst > 1e-5 || apart > 0.04) /* both look in steps */
         fail("denoising does not agree with the naive one");
-    bench_time time;
+}
+
+static void bench_denoise(const options *o, const machine *m)
+{
+    trees t = make_trees(18);
+    uint32_t cells = gsd_cell_count(t.field);
+    bench_time naive, time;
+    validate_denoise(&t, cells);
+    BENCH_TIME(naive, 3, t.leaves, {
+        for (uint32_t c = 0; c < cells; ++c)
+            free(denoise_naively(&t, c).near);
+    });
     BENCH_TIME(time, o->repeats, t.leaves, {
         for (uint32_t c = 0; c < cells; ++c)
             denoise(&t, c);
     });
     row_titles("ns per leaf");
-    row("denoise", time, 8 * m->cached, naive * 1e9 / (double)t.leaves, 170);
+    row("denoise", time, 8 * m->cached, naive.min, 170);
     free_trees(&t);
 }
 

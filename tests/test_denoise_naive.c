@@ -4,16 +4,7 @@
 #include "cmocka_prelude.h"
 
 #include "denoise_naive.h"
-
-static uint64_t rng_state = 1;
-
-static double rnd(void)
-{
-    uint64_t z = rng_state += 0x9e3779b97f4a7c15ull;
-    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9ull;
-    z = (z ^ (z >> 27)) * 0x94d049bb133111ebull;
-    return (double)((z ^ (z >> 31)) >> 11) * 0x1p-53;
-}
+#include "rng.h"
 
 #define CLOSE(a, b) assert_true(fabs((a) - (b)) <= 1e-12 * fmax(fabs(a), fabs(b)) + 1e-300)
 

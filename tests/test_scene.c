@@ -1,7 +1,7 @@
 /* test_scene.c: scene files, meshes, shapes and glTF of the example renderer (examples/tracer).
 
    contents: >>files >>transforms >>spelling >>parameters >>colours >>materials >>emitters >>camera >>shapes >>meshes
-             >>serialized >>gltf >>files >>bad >>code >>flips >>real
+             >>serialized >>gltf >>told >>bad >>code >>flips >>real
 
    GUIDE_SCENES=folder loads the downloaded scenes too (veach-ajar, veach-bidir, living-room, kitchen). */
 #include <stdlib.h>
@@ -1024,7 +1024,7 @@ static void test_gltf_without_camera_and_lights(void **state)
     assert_non_null(strstr(said, "scene.gltf: error:"));
 }
 
-/* ---- >>files ------------------------------------------------------------------------------------------------ */
+/* ---- >>told ------------------------------------------------------------------------------------------------- */
 
 static void note_file(void *user, const char *path)
 {

@@ -7,7 +7,6 @@
 
 #include <float.h>
 #include <math.h>
-#include <pthread.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -16,24 +15,12 @@
 #define GSD_IMPLEMENTATION
 #include "guide_sdtree.h"
 
+#include "crowd.h"
+#include "rng.h"
+
 #define PI 3.14159265358979323846
 
 /* ---- helpers */
-
-static uint64_t rng_state = 1;
-
-static void seed(uint64_t s) { rng_state = s * 0x9e3779b97f4a7c15ull + 1; }
-
-static uint64_t rng_next(void)
-{
-    uint64_t z = rng_state += 0x9e3779b97f4a7c15ull;
-    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9ull;
-    z = (z ^ (z >> 27)) * 0x94d049bb133111ebull;
-    return z ^ (z >> 31);
-}
-
-static double rnd(void) { return (double)(rng_next() >> 11) * 0x1p-53; }
-static float rndf(void) { return (float)(rng_next() >> 40) * 0x1p-24f; }
 
 static void random_direction(float d[3])
 {
@@ -95,43 +82,6 @@ static void use_counter(gsd_desc *d, counter *c)
     d->allocate = count_allocate;
     d->release = count_release;
     d->user = c;
-}
-
-/* parallel_for on `threads` threads, ranges handed out in small pieces from the end, to mix up the order. */
-typedef struct crowd {
-    int threads;
-} crowd;
-typedef struct crowd_job {
-    gsd_range_fn fn;
-    void *context;
-    uint32_t count, grain;
-    int threads, me;
-} crowd_job;
-
-static void *crowd_main(void *p)
-{
-    crowd_job *j = p;
-    uint32_t pieces = (j->count + j->grain - 1) / j->grain;
-    for (uint32_t k = 0; k < pieces; ++k)
-        if (k % (uint32_t)j->threads == (uint32_t)j->me) {
-            uint32_t piece = pieces - 1 - k, begin = piece * j->grain;
-            uint32_t end = begin + j->grain < j->count ? begin + j->grain : j->count;
-            j->fn(j->context, begin, end);
-        }
-    return NULL;
-}
-
-static void crowd_for(void *user, uint32_t count, uint32_t grain, gsd_range_fn fn, void *context)
-{
-    crowd *c = user;
-    pthread_t threads[8];
-    crowd_job jobs[8];
-    for (int i = 0; i < c->threads; ++i) {
-        jobs[i] = (crowd_job){fn, context, count, grain ? grain : 1, c->threads, i};
-        assert_int_equal(pthread_create(&threads[i], NULL, crowd_main, &jobs[i]), 0);
-    }
-    for (int i = 0; i < c->threads; ++i)
-        pthread_join(threads[i], NULL);
 }
 
 /* A random quadtree as plain arrays: grows `inner` nodes, preferring deep ones, to max_depth. */
@@ -1377,7 +1327,7 @@ static void test_results_do_not_depend_on_threads_or_cuts(void **state)
             gsd_view v = gsd_get_view(fields[0]);
             make_samples(&v, s, N);
             for (int k = 0; k < 5; ++k) { /* 1, 2, 3, 4, 7 threads; k + 1 streams; k + 1 calls */
-                crowd team = {k == 4 ? 7 : k + 1};
+                crowd team = {k == 4 ? 7 : k + 1, 1};
                 gsd_stream *streams[5];
                 uint32_t at = 0;
                 for (int i = 0; i <= k; ++i)

@@ -6,29 +6,20 @@
 
 #include <float.h>
 #include <math.h>
-#include <pthread.h>
 #include <stdlib.h>
 #include <string.h>
 
 #define GSD_IMPLEMENTATION
 #include "guide_sdtree.h"
 
+#include "crowd.h"
 #include "denoise_naive.h"
+#include "rng.h"
 
 #define PI 3.14159265358979323846
 #define OK(call) assert_int_equal((call), GSD_OK)
 
 /* ---- helpers */
-
-static uint64_t rng_state = 1;
-
-static double rnd(void)
-{
-    uint64_t z = rng_state += 0x9e3779b97f4a7c15ull;
-    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9ull;
-    z = (z ^ (z >> 27)) * 0x94d049bb133111ebull;
-    return (double)((z ^ (z >> 31)) >> 11) * 0x1p-53;
-}
 
 #define MOST 6000 /* nodes of a test's tree */
 
@@ -37,7 +28,7 @@ typedef struct tree {
     gsdi_sum sum[MOST];
     double mass[MOST];
     unsigned char depth[MOST];
-    float work[5][MOST];
+    float work[GSDI_BLUR_FLOATS * MOST];
     gsdi_blur blur;
 } tree;
 
@@ -55,9 +46,7 @@ static void grow(tree *t, uint32_t node, uint32_t depth, uint32_t deepest, doubl
 static void measure(tree *t, bool second_moment)
 {
     gsdi_tree_masses(t->child, t->sum, t->count, second_moment, t->mass, t->depth);
-    t->blur.mass = t->mass;
-    for (int k = 0; k < 5; ++k)
-        *(k < 2 ? &t->blur.half[k] : &t->blur.near[k - 2]) = t->work[k];
+    t->blur = gsdi_blur_make(t->work, t->count, t->mass);
 }
 
 static tree *make_tree(uint64_t seed, uint32_t deepest, double chance)
@@ -361,46 +350,7 @@ static void test_denoising_pays(void **state)
     }
 }
 
-/* A plain parallel_for that runs its ranges backwards, in other pieces than asked for. */
-static void backwards(void *user, uint32_t count, uint32_t grain, gsd_range_fn fn, void *context)
-{
-    uint32_t piece = *(uint32_t *)user * grain;
-    for (uint32_t end = count; end;) {
-        uint32_t begin = end > piece ? end - piece : 0;
-        fn(context, begin, end);
-        end = begin;
-    }
-}
-
-typedef struct piece {
-    gsd_range_fn fn;
-    void *context;
-    uint32_t begin, end;
-} piece;
-
-static void *run_piece(void *p)
-{
-    piece *q = p;
-    q->fn(q->context, q->begin, q->end);
-    return NULL;
-}
-
-static void threads(void *user, uint32_t count, uint32_t grain, gsd_range_fn fn, void *context)
-{
-    enum { N = 4 };
-    pthread_t id[N];
-    piece p[N];
-    (void)user;
-    (void)grain;
-    for (uint32_t i = 0; i < N; ++i) {
-        p[i] = (piece){fn, context, (uint32_t)((uint64_t)count * i / N), (uint32_t)((uint64_t)count * (i + 1) / N)};
-        assert_int_equal(pthread_create(&id[i], NULL, run_piece, &p[i]), 0);
-    }
-    for (uint32_t i = 0; i < N; ++i)
-        pthread_join(id[i], NULL);
-}
-
-static size_t learn_box(gsd_parallel_fn parallel, void *user, unsigned char **data)
+static size_t learn_box(gsd_parallel_fn parallel, crowd *user, unsigned char **data)
 {
     gsd_desc d;
     gsd_field *f;
@@ -438,8 +388,9 @@ static void test_any_threads_give_the_same_field(void **state)
     (void)state;
     unsigned char *serial, *other;
     size_t size = learn_box(NULL, NULL, &serial);
-    for (uint32_t pieces = 1; pieces <= 3; ++pieces) {
-        assert_int_equal(learn_box(pieces == 3 ? threads : backwards, &pieces, &other), size);
+    for (int threads = 1; threads <= 4; ++threads) {
+        crowd team = {threads, (uint32_t)(5 - threads)};
+        assert_int_equal(learn_box(crowd_for, &team, &other), size);
         assert_memory_equal(serial, other, size);
         free(other);
     }
