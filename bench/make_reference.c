@@ -395,33 +395,55 @@ static bool child_render(const options *o, const job *j, child_progress *progres
     return a.ok && sent;
 }
 
+/* A process beside this one: what it writes to its end of a pipe is read here. */
+typedef struct helper {
+    pid_t id;
+    int fd; /* this side's end */
+} helper;
+
+/* *h: h->id is 0 in the new process, which is to _exit. False, and told: there is none. */
+static bool helper_start(helper *h, const char *what)
+{
+    int fds[2];
+    fflush(NULL);
+    if (pipe(fds) != 0)
+        return die("no pipe for %s: %s", what, strerror(errno)), false;
+    h->id = fork();
+    if (h->id < 0) {
+        close(fds[0]);
+        close(fds[1]);
+        return die("no process for %s: %s; free some memory", what, strerror(errno)), false;
+    }
+    close(fds[h->id ? 1 : 0]);
+    h->fd = fds[h->id ? 0 : 1];
+    return true;
+}
+
+/* Exit status as waitpid has it. */
+static int helper_end(const helper *h)
+{
+    int status = 0;
+    close(h->fd);
+    while (waitpid(h->id, &status, 0) < 0 && errno == EINTR) {
+    }
+    return status;
+}
+
 /* Render j in a process of its own. pixels: 3 * width * height. say: let the scene's messages through. */
 static bool render_round(const options *o, const job *j, bool say, answer *a, float *pixels)
 {
-    int fds[2], status = 0;
+    helper h;
     bool show = !o->quiet && isatty(STDERR_FILENO);
     child_progress progress = {getpid(), j->label, show};
-    fflush(NULL);
-    if (pipe(fds) != 0)
-        return die("no pipe for a round: %s", strerror(errno)), false;
-    pid_t child = fork();
-    if (child < 0) {
-        close(fds[0]);
-        close(fds[1]);
-        return die("no process for a round: %s; free some memory", strerror(errno)), false;
-    }
-    if (child == 0) {
-        close(fds[0]);
-        _exit(child_render(o, j, &progress, say, fds[1]) ? 0 : 1);
-    }
-    close(fds[1]);
+    if (!helper_start(&h, "a round"))
+        return false;
+    if (h.id == 0)
+        _exit(child_render(o, j, &progress, say, h.fd) ? 0 : 1);
     *a = (answer){.ok = false};
-    bool got = read_all(fds[0], a, sizeof *a);
+    bool got = read_all(h.fd, a, sizeof *a);
     bool ok = got && a->ok;
-    ok = ok && read_all(fds[0], pixels, 3 * (size_t)o->width * (size_t)o->height * sizeof *pixels);
-    close(fds[0]);
-    while (waitpid(child, &status, 0) < 0 && errno == EINTR) {
-    }
+    ok = ok && read_all(h.fd, pixels, 3 * (size_t)o->width * (size_t)o->height * sizeof *pixels);
+    int status = helper_end(&h);
     if (show)
         fputs("\r                                                  \r", stderr);
     if (!ok && got && a->err[0])
@@ -471,22 +493,15 @@ static bool child_hash(const options *o, uint64_t hash, int fd)
 static int hash_files(const options *o, uint64_t *hash)
 {
     scene_files f = {.ok = false};
-    int fds[2];
-    fflush(NULL);
-    if (pipe(fds) != 0)
-        return die("no pipe: %s", strerror(errno));
-    pid_t child = fork();
-    if (child == 0) {
-        close(fds[0]);
-        _exit(child_hash(o, *hash, fds[1]) ? 0 : 1);
-    }
-    close(fds[1]);
-    bool got = child > 0 && read_all(fds[0], &f, sizeof f);
-    close(fds[0]);
-    while (child > 0 && waitpid(child, NULL, 0) < 0 && errno == EINTR) {
-    }
+    helper h;
+    if (!helper_start(&h, "the scene's files"))
+        return PROGRAM_FAILED;
+    if (h.id == 0)
+        _exit(child_hash(o, *hash, h.fd) ? 0 : 1);
+    bool got = read_all(h.fd, &f, sizeof f);
+    helper_end(&h);
     if (!got || !f.ok)
-        return die("%s", got ? f.err : "the scene could not be loaded: no process or not enough memory for it");
+        return die("%s", got ? f.err : "the scene could not be loaded: not enough memory for it");
     *hash = f.hash;
     return 0;
 }
