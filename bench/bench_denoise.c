@@ -253,16 +253,13 @@ static void run_runs(data *d)
     d->runs = blur_runs(d->map, WIDTH, 0, WIDTH / BLUR_ROWS, d->run);
 }
 static void run_full(data *d) { blur_full(d->own, blur_stride(WIDTH), d->out, WIDTH, WIDTH, 0, WIDTH, d->w); }
+static void run_packed(data *d) { blur_packed(d->own, blur_stride(WIDTH), d->out, d->run, d->runs, d->w); }
 #if BLUR_X86
 static void run_full_avx2(data *d) { blur_full_avx2(d->own, blur_stride(WIDTH), d->out, WIDTH, WIDTH, 0, WIDTH, d->w); }
 static void run_full_avx512(data *d)
 {
     blur_full_avx512(d->own, blur_stride(WIDTH), d->out, WIDTH, WIDTH, 0, WIDTH, d->w);
 }
-#endif
-
-static void run_packed(data *d) { blur_packed(d->own, blur_stride(WIDTH), d->out, d->run, d->runs, d->w); }
-#if BLUR_X86
 static void run_packed_avx2(data *d) { blur_packed_avx2(d->own, blur_stride(WIDTH), d->out, d->run, d->runs, d->w); }
 static void run_packed_avx512(data *d)
 {
