@@ -156,7 +156,7 @@
 #include <stdint.h>
 #include <string.h>
 
-#define GSD_VERSION 3 /* of the saved format */
+#define GSD_VERSION 4 /* of the saved format */
 
 #ifndef GSD_API /* linkage of the functions; e.g. static */
 #define GSD_API extern
@@ -177,7 +177,8 @@ extern "C" {
     X(GSD_OK, "ok")                                                                                                    \
     X(GSD_OUT_OF_MEMORY, "out of memory: lower desc.max_bytes or check desc.allocate")                                 \
     X(GSD_BAD_BOUNDS, "desc.bounds_min must lie below desc.bounds_max, both finite")                                   \
-    X(GSD_BAD_OPTION, "an enum in the descriptor is out of range: desc.target, .spatial_filter, .alpha_mode, .simd")   \
+    X(GSD_BAD_OPTION,                                                                                                  \
+      "an enum is out of range: desc.target, .spatial_filter, .alpha_mode, .denoise, .simd, pass->denoise")            \
     X(GSD_BAD_RANGE, "a number in the descriptor is out of its range: see the comments of gsd_desc")                   \
     X(GSD_BAD_ALLOCATOR, "set both desc.allocate and desc.release or neither")                                         \
     X(GSD_BAD_CELL, "no such cell: see gsd_cell_count")                                                                \
@@ -220,6 +221,12 @@ typedef enum gsd_alpha_mode {
     GSD_ALPHA_GRID     /* minimum of V(a) through the gate's estimates at five values of a, pulled towards desc.alpha */
 } gsd_alpha_mode;
 
+typedef enum gsd_denoise_mode {
+    GSD_DENOISE_DEFAULT, /* = GSD_DENOISE_BLUR; in gsd_pass: what the descriptor says */
+    GSD_DENOISE_OFF,     /* quadtrees as they were gathered */
+    GSD_DENOISE_BLUR     /* see HOW IT WORKS */
+} gsd_denoise_mode;
+
 typedef enum gsd_simd { GSD_SIMD_AUTO, GSD_SIMD_SCALAR, GSD_SIMD_AVX2, GSD_SIMD_AVX512 } gsd_simd;
 
 /* Zero-initialise it; zero means the default. Fields named no_x switch a default behaviour off. */
@@ -239,9 +246,11 @@ typedef struct gsd_desc {
     float alpha;   /* start value (and fixed value) of the probability of BSDF sampling, 0.05 .. 1; default 0.5 */
     float uniform; /* e, share of uniform sampling in the guide's density, 1e-4 .. 1; default 0.01 */
     bool no_gate;  /* guide in every cell */
-    bool no_guide_weight;  /* second-moment targets: w = 1 */
-    bool no_history;       /* clear the sums in every refine; see HOW IT WORKS */
-    bool no_denoise;       /* quadtrees as they were gathered */
+    bool no_guide_weight; /* second-moment targets: w = 1 */
+    bool no_history;      /* clear the sums in every refine; see HOW IT WORKS */
+    gsd_denoise_mode denoise;
+    float denoise_budget;  /* leaves that refine may blur, for each sample so far and beyond 131,072; 0.001 .. 1e6;
+                              default 0.25: on usual machines 20 ns a sample */
     float smoothing;       /* K, samples' worth of evenness, see HOW IT WORKS, 0.001 .. 1000; default 3 */
     bool alias;            /* build alias tables: sampling in constant time, but not monotone in u; + 12 bytes a leaf */
     float gate_margin;     /* V(1) / V(a) - 1 below which guiding does not pay, 0.001 .. 10; default 0.05 */
@@ -271,7 +280,8 @@ typedef struct gsd_training_sample {
 
 /* Optional facts about the pass that refine ends. */
 typedef struct gsd_pass {
-    bool pixel_estimate; /* the pass's pixel_contributions were relative to a pixel estimate: see Gate */
+    bool pixel_estimate;      /* the pass's pixel_contributions were relative to a pixel estimate: see Gate */
+    gsd_denoise_mode denoise; /* of this refine, in place of desc.denoise */
 } gsd_pass;
 
 typedef void (*gsd_range_fn)(void *context, uint32_t begin, uint32_t end);
@@ -292,27 +302,30 @@ typedef struct gsd_stats {
     uint64_t nodes;    /* quadtree nodes in the sampling part now */
     uint64_t leaves;   /* of which leaves */
     uint64_t building_nodes;
-    uint64_t bytes;          /* sampling and building part now */
-    uint64_t peak_bytes;     /* most held at once by both, old and new; <= max_bytes */
-    uint64_t opened, closed; /* verdicts of the gate so far */
-    uint64_t probed;         /* closed cells tried again so far */
-    uint32_t passes;         /* calls of refine */
-    uint32_t cells;          /* now */
-    uint32_t trees;          /* distinct quadtrees in the sampling part now (cells share after a split) */
-    uint32_t max_depth;      /* deepest leaf now */
-    uint32_t split_cells;    /* by the last refine */
-    uint32_t rebuilt_trees;  /* last refine: cells with new samples */
-    uint32_t waiting_cells;  /* last refine: too few new samples, tree kept */
-    uint32_t unread_cells;   /* last refine: no new samples: no work done */
-    uint32_t denoised_trees; /* last refine: blurred; the other rebuilt ones are better as they are */
-    uint32_t open_cells;     /* gate: guiding shown to pay */
-    uint32_t closed_cells;   /* gate: shown not to pay; alpha = 1 */
-    uint32_t unjudged_cells; /* gate: guiding (once there is a tree), no verdict yet */
-    float effective_rho;     /* rho of the last refine, above desc.rho where max_bytes forced it; best desc.rho */
-    float mean_depth;        /* mean over trees of leaf depth weighted by mass; 0 = nothing learned */
-    float closed_share;      /* share of the last pass's samples in closed cells, 0 .. 1 */
-    float mean_alpha;        /* over the last pass's samples, closed cells as 1 */
-    float mean_blur;         /* of the trees that the last refine rebuilt: how far shares moved towards those around */
+    uint64_t bytes;             /* sampling and building part now */
+    uint64_t peak_bytes;        /* most held at once by both, old and new; <= max_bytes */
+    uint64_t opened, closed;    /* verdicts of the gate so far */
+    uint64_t probed;            /* closed cells tried again so far */
+    uint64_t denoised_leaves;   /* of all quadtrees that refine tried to blur so far */
+    uint32_t passes;            /* calls of refine */
+    uint32_t cells;             /* now */
+    uint32_t trees;             /* distinct quadtrees in the sampling part now (cells share after a split) */
+    uint32_t max_depth;         /* deepest leaf now */
+    uint32_t split_cells;       /* by the last refine */
+    uint32_t rebuilt_trees;     /* last refine: cells with new samples */
+    uint32_t waiting_cells;     /* last refine: too few new samples, tree kept */
+    uint32_t unread_cells;      /* last refine: no new samples: no work done */
+    uint32_t denoised_trees;    /* last refine: rebuilt and blurred */
+    uint32_t smooth_trees;      /* last refine: rebuilt, better without a blur by what their samples say */
+    uint32_t over_budget_trees; /* last refine: rebuilt and left as they are, see desc.denoise_budget */
+    uint32_t open_cells;        /* gate: guiding shown to pay */
+    uint32_t closed_cells;      /* gate: shown not to pay; alpha = 1 */
+    uint32_t unjudged_cells;    /* gate: guiding (once there is a tree), no verdict yet */
+    float effective_rho;        /* rho of the last refine, above desc.rho where max_bytes forced it; best desc.rho */
+    float mean_depth;           /* mean over trees of leaf depth weighted by mass; 0 = nothing learned */
+    float closed_share;         /* share of the last pass's samples in closed cells, 0 .. 1 */
+    float mean_alpha;           /* over the last pass's samples, closed cells as 1 */
+    float mean_blur; /* of the trees that the last refine rebuilt: how far shares moved towards those around */
     float reserved;
 } gsd_stats;
 
@@ -936,11 +949,12 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_SPLIT 2.0            /* a cell splits above that times sqrt(samples held): tuned on SF1 (1 .. 2), ajar */
 #define GSDI_MIN_SPLIT 32.0       /* at least */
 #define GSDI_LIT                                                                                                       \
-    24.0                    /* ... times its share of non-zero samples: parts of a dark cell would know too little;    \
-                               tuned on lamps, ajar (8 .. 32) */
-#define GSDI_BLUR_EVEN 0.05 /* share of evenness in the density that one half of the samples says of the other */
-#define GSDI_BLUR_MOST 0.6  /* of the way towards the surroundings, for one half */
-#define GSDI_BLUR_STEPS 5   /* halvings of the interval that holds the best blur */
+    24.0                      /* ... times its share of non-zero samples: parts of a dark cell would know too little;  \
+                                 tuned on lamps, ajar (8 .. 32) */
+#define GSDI_BLUR_EVEN 0.05   /* share of evenness in the density that one half of the samples says of the other */
+#define GSDI_BLUR_MOST 0.6    /* of the way towards the surroundings, for one half */
+#define GSDI_BLUR_STEPS 5     /* halvings of the interval that holds the best blur */
+#define GSDI_BLUR_FREE 131072 /* leaves that are blurred whatever the budget */
 #define GSDI_MAX_CELLS (1u << 26)
 
 /* ---- >>memory ----------------------------------------------------------------------------------------------- */
@@ -2357,6 +2371,7 @@ typedef struct gsdi_job {
     double blur;       /* of its tree; 0 = not denoised */
     double limit_mass; /* total mass of its building tree */
     uint32_t rebuild;  /* 1: new sampling tree from the building tree */
+    uint32_t denoise;  /* 1: blur it first */
     uint32_t groups;   /* of that tree */
     uint32_t nodes;    /* of the next building tree */
     uint32_t tree;     /* index of its sampling tree in the new block */
@@ -2381,6 +2396,7 @@ typedef struct gsdi_refinement {
     const gsd_desc *desc;
     bool second_moment, clear;
     gsd_target target; /* of the next pass */
+    gsd_denoise_mode denoise;
     double all_samples, held_samples;
     double rho, keep, split;
     double fade;          /* of the gate's sums */
@@ -2453,7 +2469,7 @@ static void gsdi_denoise_range(void *context, uint32_t begin, uint32_t end)
         const gsdi_state *s = &r->field->states[c];
         gsdi_job *job = &r->jobs[c];
         gsdi_blur b;
-        if (!job->rebuild || s->count < 5)
+        if (!job->denoise)
             continue;
         b = gsdi_blur_make(r->blur + GSDI_BLUR_FLOATS * (size_t)s->first, s->count, r->mass + s->first);
         job->blur = gsdi_blur_tree(r->field->child + s->first, r->field->sum + s->first, r->depth + s->first, s->count,
@@ -2462,24 +2478,51 @@ static void gsdi_denoise_range(void *context, uint32_t begin, uint32_t end)
     }
 }
 
+static uint32_t gsdi_building_leaves(const gsdi_state *s) { return s->count - (s->count - 1) / 4; }
+
+/* Choose the trees to denoise: all that are divided or, over the budget, an even selection that starts elsewhere in
+   every pass. */
+static void gsdi_denoise_choose(gsdi_refinement *r)
+{
+    gsd_stats *stats = &r->stats;
+    uint32_t cells = r->field->block->cells, i, c = (uint32_t)((uint64_t)cells * (r->field->passes % 8) / 8);
+    double allowed = GSDI_BLUR_FREE + (double)r->desc->denoise_budget * (double)stats->samples, needed = 0, due = 0;
+    allowed = fmax(allowed - (double)stats->denoised_leaves, 0);
+    for (i = 0; i < cells; ++i)
+        needed += r->jobs[i].rebuild && r->field->states[i].count > 1 ? gsdi_building_leaves(&r->field->states[i]) : 0;
+    for (i = 0; i < cells; ++i, c = c + 1 < cells ? c + 1 : 0) {
+        double leaves = gsdi_building_leaves(&r->field->states[c]);
+        if (!r->jobs[c].rebuild || r->field->states[c].count == 1)
+            continue;
+        due += needed > allowed ? leaves * (allowed / needed) : leaves;
+        if (due < leaves) {
+            stats->over_budget_trees++;
+            continue;
+        }
+        due -= leaves;
+        r->jobs[c].denoise = 1;
+        stats->denoised_leaves += (uint64_t)leaves;
+    }
+}
+
 /* Denoise the masses of the old cells' building trees. False = out of memory. */
 static bool gsdi_denoise(gsdi_refinement *r, gsd_parallel_fn parallel, void *user)
 {
     uint32_t cells = r->field->block->cells, i;
     double blur = 0;
-    r->stats.denoised_trees = 0;
-    r->stats.mean_blur = 0;
-    if (r->desc->no_denoise)
+    if (r->denoise == GSD_DENOISE_OFF)
         return true;
     r->blur = (float *)gsdi_allocate(r->desc, r->field->building_nodes, GSDI_BLUR_FLOATS * sizeof(float));
     if (!r->blur)
         return false;
+    gsdi_denoise_choose(r);
     gsdi_run(parallel, user, cells, 16, gsdi_denoise_range, r);
     gsdi_release(r->desc, r->blur);
     for (i = 0; i < cells; ++i) {
         r->stats.denoised_trees += r->jobs[i].blur > 0;
         blur += r->jobs[i].blur;
     }
+    r->stats.smooth_trees = r->stats.rebuilt_trees - r->stats.denoised_trees - r->stats.over_budget_trees;
     if (r->stats.rebuilt_trees)
         r->stats.mean_blur = (float)(blur / r->stats.rebuilt_trees);
     return true;
@@ -2644,7 +2687,7 @@ static uint64_t gsdi_refine_peak(const gsdi_refinement *r, const gsdi_block *blo
     const gsd_field *f = r->field;
     uint64_t next = gsdi_bytes(block, nodes), blur = f->building_nodes * (uint64_t)GSDI_BLUR_FLOATS * sizeof(float);
     return gsdi_bytes(f->block, f->node_capacity) + (f->state_capacity - f->block->cells) * sizeof(gsdi_state) +
-           (next > blur || r->desc->no_denoise ? next : blur) +
+           (next > blur || r->denoise == GSD_DENOISE_OFF ? next : blur) +
            gsdi_refine_scratch(f->block, f->building_nodes, r->place_capacity, r->spatial_capacity);
 }
 
@@ -2961,8 +3004,13 @@ GSD_API gsd_result gsd_refine(gsd_field *field, const gsd_pass *pass, gsd_parall
     memset(&r, 0, sizeof r);
     r.field = field;
     r.desc = &field->desc;
+    r.denoise = pass && pass->denoise ? pass->denoise : r.desc->denoise;
+    if ((unsigned)r.denoise > GSD_DENOISE_BLUR)
+        return GSD_BAD_OPTION;
     r.stats = field->stats;
     r.stats.split_cells = r.stats.rebuilt_trees = r.stats.waiting_cells = r.stats.unread_cells = 0;
+    r.stats.denoised_trees = r.stats.smooth_trees = r.stats.over_budget_trees = 0;
+    r.stats.mean_blur = 0;
     r.second_moment = field->target != GSD_TARGET_RADIANCE;
     for (i = 0; i < field->block->cells; ++i)
         samples += field->states[i].fresh;
@@ -3043,6 +3091,8 @@ GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
     d.spatial_filter = d.spatial_filter ? d.spatial_filter : GSD_SPATIAL_NEAREST;
     d.directional_filter = d.directional_filter ? d.directional_filter : GSD_DIRECTIONAL_BOX;
     d.alpha_mode = d.alpha_mode ? d.alpha_mode : GSD_ALPHA_GRID;
+    d.denoise = d.denoise ? d.denoise : GSD_DENOISE_BLUR;
+    gsdi_default_float(&d.denoise_budget, 0.25f);
     gsdi_default_float(&d.switch_after, 4);
     gsdi_default_float(&d.rho, 0.01f);
     gsdi_default_float(&d.smoothing, 3);
@@ -3057,12 +3107,13 @@ GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
     gsdi_default_u32(&d.gate_probe, 1);
     if ((unsigned)d.target > GSD_TARGET_SWITCHING || (unsigned)d.spatial_filter > GSD_SPATIAL_STOCHASTIC ||
         (unsigned)d.directional_filter > GSD_DIRECTIONAL_BOX || (unsigned)d.alpha_mode > GSD_ALPHA_GRID ||
-        (unsigned)d.simd > GSD_SIMD_AVX512)
+        (unsigned)d.denoise > GSD_DENOISE_BLUR || (unsigned)d.simd > GSD_SIMD_AVX512)
         return GSD_BAD_OPTION;
     d.simd = gsdi_simd(d.simd);
     if (d.simd == GSD_SIMD_AUTO)
         return GSD_BAD_OPTION;
     if (!gsdi_within((double)d.switch_after, 0.99e-3, 1e6) || !gsdi_within((double)d.smoothing, 0.99e-3, 1000) ||
+        !gsdi_within((double)d.denoise_budget, 0.99e-3, 1e6) ||
         (d.split_samples != 0 && !gsdi_within((double)d.split_samples, 16, 1e9)) ||
         !gsdi_within((double)d.rho, 0.99e-5, 1) || !gsdi_within(d.max_depth, 1, 20) ||
         !gsdi_within(d.max_levels, 1, 60) || !gsdi_within((double)d.alpha, 0.0499, 1) ||
@@ -3902,6 +3953,7 @@ GSD_API void gsd_sample_batch(const gsd_view *view, uint32_t count, const uint32
     X(uint32_t, target, gsd_target)                                                                                    \
     X(float, switch_after, float)                                                                                      \
     X(float, smoothing, float)                                                                                         \
+    X(float, denoise_budget, float)                                                                                    \
     X(uint32_t, max_depth, uint32_t)                                                                                   \
     X(uint32_t, max_levels, uint32_t)                                                                                  \
     X(uint32_t, min_samples, uint32_t)                                                                                 \
@@ -3913,7 +3965,7 @@ GSD_API void gsd_sample_batch(const gsd_view *view, uint32_t count, const uint32
     X(uint32_t, no_gate, bool)                                                                                         \
     X(uint32_t, no_guide_weight, bool)                                                                                 \
     X(uint32_t, no_history, bool)                                                                                      \
-    X(uint32_t, no_denoise, bool)                                                                                      \
+    X(uint32_t, denoise, gsd_denoise_mode)                                                                             \
     X(uint32_t, alias, bool)                                                                                           \
     X(float, split_samples, float)                                                                                     \
     X(float, rho, float)                                                                                               \
@@ -3957,7 +4009,8 @@ static gsd_result gsdi_file_desc(const gsdi_file *f, const gsd_desc *given, gsd_
 {
     memset(d, 0, sizeof *d);
 #define GSDI_READ(type, name, given_type) d->name = (given_type)f->name;
-    if (f->target > 255 || f->spatial_filter > 255 || f->directional_filter > 255 || f->alpha_mode > 255)
+    if (f->target > 255 || f->spatial_filter > 255 || f->directional_filter > 255 || f->alpha_mode > 255 ||
+        f->denoise > 255)
         return GSD_BAD_OPTION;
     GSDI_OPTIONS(GSDI_READ)
 #undef GSDI_READ

@@ -574,7 +574,7 @@ static void validate_learning(const options *o)
     gsd_desc desc = o->desc;
     naive_learner naive = naive_create(1e9, 0.01);
     static const float middle[3] = {0.5f, 0.5f, 0.5f};
-    desc.no_denoise = true; /* validate_denoise checks that */
+    desc.denoise = GSD_DENOISE_OFF; /* validate_denoise checks that */
     desc.target = GSD_TARGET_RADIANCE;
     desc.split_samples = 1e9f;
     desc.rho = 0.01f;

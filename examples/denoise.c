@@ -83,7 +83,7 @@ static int panel(int number, const char *title, int samples, bool denoise)
     desc.target = GSD_TARGET_RADIANCE;
     desc.split_samples = 1e9f; /* one cell */
     desc.no_gate = true;
-    desc.no_denoise = !denoise;
+    desc.denoise = denoise ? GSD_DENOISE_BLUR : GSD_DENOISE_OFF;
     rng = 1;
     int bad = gsd_create(&desc, &field) || gsd_stream_create(field, &stream);
     for (int pass = 0; !bad && pass < PASSES; ++pass) {

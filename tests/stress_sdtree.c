@@ -293,6 +293,8 @@ static gsd_desc any_desc(stress *s)
     d.switch_after = stress_chance(s, 0.5) ? 0 : (float)stress_log(s, 0.001, 10);
     d.uniform = stress_chance(s, 0.7) ? 0 : (float)stress_log(s, 1e-4, 1);
     d.smoothing = stress_chance(s, 0.7) ? 0 : (float)stress_log(s, 0.001, 1000);
+    d.denoise = (gsd_denoise_mode)stress_below(s, 3);
+    d.denoise_budget = stress_chance(s, 0.7) ? 0 : (float)stress_log(s, 0.001, 1e6);
     d.alpha = stress_chance(s, 0.7) ? 0 : 0.05f + 0.95f * stress_unitf(s);
     d.max_bytes = (uint64_t)1 << (20 + stress_below(s, 6));
     d.forest_cells = stress_chance(s, 0.2) ? 1 + stress_below(s, 20) : 0;
@@ -438,7 +440,7 @@ static gsd_result record(stress *s, gsd_stream *stream, const gsd_field *f, uint
 /* One pass over a batch of n samples; without memory trouble nothing may fail. */
 static void learn(stress *s, gsd_field *f, gsd_stream *stream, uint32_t n)
 {
-    gsd_pass pass = {stress_chance(s, 0.5)};
+    gsd_pass pass = {stress_chance(s, 0.5), (gsd_denoise_mode)stress_below(s, 3)};
     STRESS_CHECK(s, record(s, stream, f, n) == GSD_OK, "record");
     STRESS_CHECK(s, gsd_accumulate(f, &stream, 1, NULL, NULL) == GSD_OK, "accumulate");
     gsd_stream_clear(stream);
@@ -597,10 +599,18 @@ typedef struct limit {
         offsetof(gsd_desc, name), whole, low, high                                                                     \
     }
 static const limit limits[] = {
-    LIMIT(switch_after, false, 0.001, 1e6), LIMIT(split_samples, false, 16, 1e9), LIMIT(rho, false, 1e-5, 1),
-    LIMIT(max_depth, true, 1, 20),          LIMIT(max_levels, true, 1, 60),       LIMIT(alpha, false, 0.05, 1),
-    LIMIT(uniform, false, 1e-4, 1),         LIMIT(smoothing, false, 1e-3, 1000),  LIMIT(gate_margin, false, 0.001, 10),
-    LIMIT(gate_gain, false, 1e-4, 1000),    LIMIT(gate_probe, true, 1, 1000),
+    LIMIT(switch_after, false, 0.001, 1e6),
+    LIMIT(split_samples, false, 16, 1e9),
+    LIMIT(rho, false, 1e-5, 1),
+    LIMIT(max_depth, true, 1, 20),
+    LIMIT(max_levels, true, 1, 60),
+    LIMIT(alpha, false, 0.05, 1),
+    LIMIT(uniform, false, 1e-4, 1),
+    LIMIT(smoothing, false, 1e-3, 1000),
+    LIMIT(denoise_budget, false, 1e-3, 1e6),
+    LIMIT(gate_margin, false, 0.001, 10),
+    LIMIT(gate_gain, false, 1e-4, 1000),
+    LIMIT(gate_probe, true, 1, 1000),
 };
 
 /* Put one option at or beyond a limit; true where it must be refused. */

@@ -306,7 +306,7 @@ static void test_sizes_are_as_documented(void **state)
     assert_int_equal(sizeof(gsd_training_sample), 44);
     assert_int_equal(sizeof(gsdi_tree), 32);
     assert_true(sizeof(gsdi_state) < 600);
-    assert_int_equal(sizeof(gsd_stats), 14 * 8 + 18 * 4);
+    assert_int_equal(sizeof(gsd_stats), 15 * 8 + 20 * 4);
     assert_int_equal(sizeof(gsdi_sum) + sizeof(uint32_t), 20);
     /* bytes of a field: 16 a node in the sampling part, 20 in the building part */
     gsd_field *few = forest_of(1, 40, 16, false, GSD_SIMD_AUTO), *many = forest_of(1, 1040, 16, false, GSD_SIMD_AUTO);
@@ -1376,7 +1376,7 @@ static void test_targets_match_a_naive_reference(void **state)
         d.no_history = true;
         d.alpha_mode = GSD_ALPHA_FIXED;
         d.no_gate = true;
-        d.no_denoise = true; /* test_sdtree_denoise.c */
+        d.denoise = GSD_DENOISE_OFF; /* test_sdtree_denoise.c */
         OK(gsd_create(&d, &f));
         for (int pass = 0; pass < 4; ++pass) {
             gsd_view v = gsd_get_view(f);
@@ -1455,7 +1455,7 @@ static void test_targets_with_normals_match_a_naive_reference(void **state)
         d.alpha_mode = GSD_ALPHA_FIXED;
         d.alpha = 0.3f;
         d.no_gate = true;
-        d.no_denoise = true; /* test_sdtree_denoise.c */
+        d.denoise = GSD_DENOISE_OFF; /* test_sdtree_denoise.c */
         OK(gsd_create(&d, &f));
         for (int pass = 0; pass < 4; ++pass) {
             gsd_view v = gsd_get_view(f);
@@ -1575,7 +1575,7 @@ static void test_smoothing_matches_a_naive_reference(void **state)
             d.alpha_mode = GSD_ALPHA_FIXED;
             d.no_gate = true;
             d.no_guide_weight = true;
-            d.no_denoise = true; /* test_sdtree_denoise.c */
+            d.denoise = GSD_DENOISE_OFF; /* test_sdtree_denoise.c */
             OK(gsd_create(&d, &f));
             double pull = smoothing[strength] > 0 ? (double)smoothing[strength] : (double)gsd_get_desc(f)->smoothing;
             memset(sum, 0, sizeof sum);
@@ -2444,7 +2444,7 @@ static void test_gate_weighs_by_pixels(void **state)
     for (int dark = 0; dark < 2; ++dark) {
         gsd_desc d = unit_cube(GSD_TARGET_SIMPLE);
         gsd_field *f;
-        gsd_pass info = {true};
+        gsd_pass info = {.pixel_estimate = true};
         gsd_stats stats;
         static gsd_training_sample s[40000];
         seed(6);

@@ -280,7 +280,7 @@ static double trained(int kind, int n, gsd_target target, bool denoise, uint64_t
     d.bounds_max[0] = d.bounds_max[1] = d.bounds_max[2] = 1;
     d.target = target;
     d.split_samples = 1e9f;
-    d.no_denoise = !denoise;
+    d.denoise = denoise ? GSD_DENOISE_BLUR : GSD_DENOISE_OFF;
     d.no_gate = true;
     OK(gsd_create(&d, &f));
     OK(gsd_stream_create(f, &s));
@@ -350,18 +350,18 @@ static void test_denoising_pays(void **state)
     }
 }
 
-static size_t learn_box(gsd_parallel_fn parallel, crowd *user, unsigned char **data)
+/* 5 passes of n samples each in a box, light of two kinds. */
+static void learn_box(const gsd_desc *options, int n, gsd_parallel_fn parallel, crowd *user, gsd_field **field)
 {
-    gsd_desc d;
+    gsd_desc d = *options;
     gsd_field *f;
     gsd_stream *s;
-    memset(&d, 0, sizeof d);
     d.bounds_max[0] = d.bounds_max[1] = d.bounds_max[2] = 1;
     OK(gsd_create(&d, &f));
     OK(gsd_stream_create(f, &s));
     rng_state = 5;
     for (int pass = 0; pass < 5; ++pass) {
-        for (int i = 0; i < 6000; ++i) {
+        for (int i = 0; i < n; ++i) {
             float at[3] = {(float)rnd(), (float)rnd(), (float)rnd()}, w[3];
             gsd_direction(rnd() * 16777216, rnd() * 16777216, w);
             float L = (float)(light(i % 2, w) * rnd());
@@ -372,13 +372,24 @@ static size_t learn_box(gsd_parallel_fn parallel, crowd *user, unsigned char **d
         gsd_stream_clear(s);
         OK(gsd_refine(f, NULL, parallel, user));
     }
+    gsd_stream_destroy(s);
+    *field = f;
+}
+
+static size_t saved_box(gsd_parallel_fn parallel, crowd *user, unsigned char **data)
+{
+    gsd_desc d;
+    gsd_field *f;
     gsd_stats stats;
+    memset(&d, 0, sizeof d);
+    learn_box(&d, 6000, parallel, user, &f);
     gsd_get_stats(f, &stats);
     assert_true(stats.cells > 20 && stats.denoised_trees > stats.cells / 4 && stats.mean_blur > 0.02f);
+    assert_true(stats.over_budget_trees == 0);
+    assert_int_equal(stats.denoised_trees + stats.smooth_trees, stats.rebuilt_trees);
     size_t size = gsd_save_bound(f);
     *data = malloc(size);
     OK(gsd_save(f, *data, size, &size));
-    gsd_stream_destroy(s);
     gsd_destroy(f);
     return size;
 }
@@ -387,14 +398,80 @@ static void test_any_threads_give_the_same_field(void **state)
 {
     (void)state;
     unsigned char *serial, *other;
-    size_t size = learn_box(NULL, NULL, &serial);
+    size_t size = saved_box(NULL, NULL, &serial);
     for (int threads = 1; threads <= 4; ++threads) {
         crowd team = {threads, (uint32_t)(5 - threads)};
-        assert_int_equal(learn_box(crowd_for, &team, &other), size);
+        assert_int_equal(saved_box(crowd_for, &team, &other), size);
         assert_memory_equal(serial, other, size);
         free(other);
     }
     free(serial);
+}
+
+/* What is blurred comes within 10 % of the budget where that binds, and never goes beyond. */
+static void test_budget_is_kept(void **state)
+{
+    (void)state;
+    for (int k = 0; k < 4; ++k) {
+        static const float budgets[4] = {0.05f, 0.1f, 0.5f, 1000};
+        gsd_desc d;
+        gsd_field *f;
+        gsd_stats stats;
+        memset(&d, 0, sizeof d);
+        d.denoise_budget = budgets[k];
+        d.split_samples = 200;
+        d.rho = 0.0005f;
+        learn_box(&d, 60000, NULL, NULL, &f);
+        gsd_get_stats(f, &stats);
+        double allowed = GSDI_BLUR_FREE + (double)d.denoise_budget * (double)stats.samples;
+        print_message("budget %g: %.0f leaves of %.0f, last pass %u trees over it\n", (double)d.denoise_budget,
+                      (double)stats.denoised_leaves, allowed, stats.over_budget_trees);
+        assert_true((double)stats.denoised_leaves <= allowed);
+        if (k < 3)
+            assert_true(stats.over_budget_trees > 0 && (double)stats.denoised_leaves >= 0.9 * allowed);
+        else
+            assert_true(stats.over_budget_trees == 0);
+        assert_int_equal(stats.denoised_trees + stats.smooth_trees + stats.over_budget_trees, stats.rebuilt_trees);
+        gsd_destroy(f);
+    }
+}
+
+/* One pass may be denoised in another way than the descriptor says. */
+static void test_pass_says_otherwise(void **state)
+{
+    (void)state;
+    for (int on = 0; on < 2; ++on) {
+        gsd_desc d;
+        gsd_field *f;
+        gsd_stats stats;
+        gsd_pass pass = {.denoise = on ? GSD_DENOISE_BLUR : GSD_DENOISE_OFF};
+        gsd_training_sample sample;
+        gsd_stream *s;
+        float at[3] = {0.4f, 0.5f, 0.6f}, up[3] = {0, 0, 1};
+        memset(&d, 0, sizeof d);
+        d.denoise = on ? GSD_DENOISE_OFF : GSD_DENOISE_BLUR;
+        learn_box(&d, 20000, NULL, NULL, &f);
+        gsd_get_stats(f, &stats);
+        assert_true(on ? stats.denoised_trees == 0 : stats.denoised_trees > 0);
+        OK(gsd_stream_create(f, &s));
+        for (int i = 0; i < 5000; ++i) {
+            at[0] = (float)rnd();
+            sample = gsd_make_scalar_sample(at, up, NULL, 1, 1, 1, GSD_INV_4PI, GSD_INV_4PI, 0);
+            OK(gsd_record(s, &sample, 1));
+        }
+        OK(gsd_accumulate(f, &s, 1, NULL, NULL));
+        gsd_stream_clear(s);
+        pass.denoise = (gsd_denoise_mode)99;
+        assert_int_equal(gsd_refine(f, &pass, NULL, NULL), GSD_BAD_OPTION);
+        pass.denoise = on ? GSD_DENOISE_BLUR : GSD_DENOISE_OFF;
+        OK(gsd_refine(f, &pass, NULL, NULL));
+        gsd_get_stats(f, &stats);
+        assert_true(stats.rebuilt_trees > 0);
+        assert_true(on ? stats.denoised_trees + stats.smooth_trees == stats.rebuilt_trees
+                       : stats.denoised_trees + stats.smooth_trees == 0);
+        gsd_stream_destroy(s);
+        gsd_destroy(f);
+    }
 }
 
 int main(void)
@@ -405,6 +482,8 @@ int main(void)
         cmocka_unit_test(test_hostile_trees_keep_their_mass),
         cmocka_unit_test(test_even_trees_stay_even),
         cmocka_unit_test(test_denoising_pays),
+        cmocka_unit_test(test_budget_is_kept),
+        cmocka_unit_test(test_pass_says_otherwise),
         cmocka_unit_test(test_any_threads_give_the_same_field),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
