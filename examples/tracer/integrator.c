@@ -4,7 +4,7 @@
      >>intersect  trace, add emission, prepare closures
      >>find       method.find on the vertices that have a smooth part
      >>nee        sample a light, weigh it against the mixture, trace a shadow ray
-     >>scatter    roulette, then a direction from bsdf or guide: one-sample MIS (Veach 1997)
+     >>scatter    roulette and splitting, then a direction from bsdf or guide: one-sample MIS (Veach 1997)
      >>record     carry radiance back along each path and hand the vertices to the method
 
    Random numbers: each path has two generators. The guide draws from the second one only, so that a render whose
@@ -31,7 +31,8 @@ typedef struct path {
     bool specular;  /* the last bounce was a delta one, or there was none */
     bool seen;      /* a non-delta vertex has been met */
     int x, y;
-    int last; /* newest link, -1 = none */
+    int last;       /* newest link, -1 = none */
+    int root, join; /* the camera path that it belongs to; link of the path it was split from, -1 = none */
 } path;
 
 /* A path vertex, kept for the way back. */
@@ -48,24 +49,25 @@ typedef struct link {
 
 struct tr_worker {
     tr_counters counters;
-    path paths[TR_BATCH];
-    int active[TR_BATCH], active_count;
-    struct RTCRayHit hits[TR_BATCH];
-    tr_surface surfaces[TR_BATCH];
-    tr_closure closures[TR_BATCH];
+    path paths[TR_PATHS];
+    int path_count; /* camera paths first, then what was split off */
+    int active[TR_PATHS], active_count;
+    struct RTCRayHit hits[TR_PATHS];
+    tr_surface surfaces[TR_PATHS];
+    tr_closure closures[TR_PATHS];
     /* Vertices with a smooth part, by their place k in the lookup. */
-    int smooth[TR_BATCH], smooth_count;
-    int place[TR_BATCH]; /* path -> k, -1 = none */
-    vec3 p[TR_BATCH], side[TR_BATCH], wo[TR_BATCH];
-    float roughness[TR_BATCH], find_u[TR_BATCH][3], alpha[TR_BATCH], reflected[TR_BATCH];
+    int smooth[TR_PATHS], smooth_count;
+    int place[TR_PATHS]; /* path -> k, -1 = none */
+    vec3 p[TR_PATHS], side[TR_PATHS], wo[TR_PATHS];
+    float roughness[TR_PATHS], find_u[TR_PATHS][3], alpha[TR_PATHS], reflected[TR_PATHS];
     void *handles;
-    int index[TR_BATCH];
-    vec3 wi[TR_BATCH];
-    float pdf_guide[TR_BATCH], sample_u[TR_BATCH][2];
+    int index[TR_PATHS];
+    vec3 wi[TR_PATHS];
+    float pdf_guide[TR_PATHS], sample_u[TR_PATHS][2];
     /* NEE */
-    tr_light_sample lights[TR_BATCH];
-    vec3 light_f[TR_BATCH];
-    float light_pdf_bsdf[TR_BATCH];
+    tr_light_sample lights[TR_PATHS];
+    vec3 light_f[TR_PATHS];
+    float light_pdf_bsdf[TR_PATHS];
     /* way back */
     tr_vertex *vertices;
     link *links;
@@ -80,11 +82,11 @@ tr_worker *tr_worker_create(const tr_frame *frame)
     if (!w)
         return NULL;
     size_t handle_size = frame->method->handle_size ? frame->method->handle_size : 1;
-    if (posix_memalign(&w->handles, 64, handle_size * TR_BATCH) != 0) {
+    if (posix_memalign(&w->handles, 64, handle_size * TR_PATHS) != 0) {
         free(w);
         return NULL;
     }
-    memset(w->handles, 0, handle_size * TR_BATCH);
+    memset(w->handles, 0, handle_size * TR_PATHS);
     return w;
 }
 
@@ -100,21 +102,21 @@ void tr_worker_destroy(tr_worker *w)
 
 tr_counters *tr_worker_counters(tr_worker *w) { return &w->counters; }
 
-/* Room for one batch's worth of new vertices, so that the stages need not check. */
+/* Room for what one bounce adds at most, so that the stages need not check. */
 static bool reserve(tr_worker *w, bool recording)
 {
     if (!recording)
         return true;
-    if (w->vertex_count + TR_BATCH > w->vertex_capacity) {
-        int capacity = w->vertex_capacity ? 2 * w->vertex_capacity : 8 * TR_BATCH;
+    if (w->vertex_count + TR_PATHS > w->vertex_capacity) {
+        int capacity = w->vertex_capacity ? 2 * w->vertex_capacity : 8 * TR_PATHS;
         tr_vertex *grown = realloc(w->vertices, sizeof *grown * (size_t)capacity);
         if (!grown)
             return false;
         w->vertices = grown;
         w->vertex_capacity = capacity;
     }
-    if (w->link_count + TR_BATCH > w->link_capacity) {
-        int capacity = w->link_capacity ? 2 * w->link_capacity : 8 * TR_BATCH;
+    if (w->link_count + 2 * TR_PATHS > w->link_capacity) {
+        int capacity = w->link_capacity ? 2 * w->link_capacity : 8 * TR_PATHS;
         link *grown = realloc(w->links, sizeof *grown * (size_t)capacity);
         if (!grown)
             return false;
@@ -199,11 +201,13 @@ static void start_paths(tr_worker *w, const tr_frame *frame, int tile, int sampl
             p->seen = false;
             p->x = x;
             p->y = y;
-            p->last = -1;
+            p->last = p->join = -1;
+            p->root = w->active_count;
             camera_ray(frame, p);
             w->active[w->active_count] = w->active_count;
             w->active_count++;
         }
+    w->path_count = w->active_count;
     w->counters.paths += (uint64_t)w->active_count;
 }
 
@@ -248,7 +252,12 @@ static void trace_paths(tr_worker *w, const tr_frame *frame)
     w->counters.trace += tr_wall_seconds() - start;
 }
 
-static void add_radiance(path *p, vec3 L) { p->radiance = add3(p->radiance, mul3(p->throughput, L)); }
+/* Radiance L towards path p counts for its camera path. */
+static void add_radiance(tr_worker *w, const path *p, vec3 L)
+{
+    path *root = &w->paths[p->root];
+    root->radiance = add3(root->radiance, mul3(p->throughput, L));
+}
 
 /* MIS weight of emission met by a traced direction against NEE. */
 static float emission_weight(const tr_frame *frame, const path *p, const tr_surface *hit)
@@ -290,7 +299,7 @@ static bool meet(tr_worker *w, const tr_frame *frame, int id, int depth, bool re
     }
     if (!black3(emitted)) {
         emitted = scale3(emitted, emission_weight(frame, p, met ? s : NULL));
-        add_radiance(p, emitted);
+        add_radiance(w, p, emitted);
     }
     if (recording) {
         link *l = push_link(w, p);
@@ -380,7 +389,7 @@ static void find_handles(tr_worker *w, const tr_frame *frame)
 /* The alpha, cell and depth layers: at the first vertex of each path that could be guided. */
 static void describe_vertices(tr_worker *w, const tr_frame *frame)
 {
-    float cell[TR_BATCH], depth[TR_BATCH];
+    float cell[TR_PATHS], depth[TR_PATHS];
     bool describe = frame->describe && frame->guiding && frame->method->describe && w->smooth_count > 0;
     if (describe)
         frame->method->describe(frame->method_data, w->smooth_count, w->handles, cell, depth);
@@ -475,7 +484,7 @@ static void next_event(tr_worker *w, const tr_frame *frame, bool recording)
             weight = balance(l->pdf, mixture(c, w->alpha[k], w->light_pdf_bsdf[k], w->pdf_guide[k]));
         float cosine = fabsf(dot3(c->frame.n, l->wi));
         vec3 reflected = scale3(mul3(w->light_f[k], l->radiance), weight * cosine / l->pdf);
-        add_radiance(p, reflected);
+        add_radiance(w, p, reflected);
         if (recording)
             w->links[p->last].reflected = reflected;
     }
@@ -484,8 +493,12 @@ static void next_event(tr_worker *w, const tr_frame *frame, bool recording)
 /* ---- >>scatter ---------------------------------------------------------------------------------------------- */
 
 #define ROULETTE_DEPTH 5
-#define ROULETTE_LOW (1.0f / 3) /* lower end of the weight window for a ratio of 5 (Vorba and Krivanek 2016) */
-#define ROULETTE_MIN 0.1f       /* no weight grows by more than ten at once */
+/* Weight window around what the pixel needs: below LOW paths are ended, above HIGH they are split. The ratio is that of
+   Vorba and Krivanek 2016, the place half of theirs: measured best over our scenes. */
+#define ROULETTE_LOW (1.0f / 6)
+#define ROULETTE_HIGH (5.0f / 6)
+#define ROULETTE_MIN 0.1f /* no weight grows by more than ten at once */
+#define ROULETTE_MOST 6   /* paths that one becomes */
 
 /* Survival by the product of albedos. */
 static float throughput_survival(tr_worker *w, int id, int depth)
@@ -499,35 +512,84 @@ static float throughput_survival(tr_worker *w, int id, int depth)
     return q;
 }
 
-/* Survival by expected contribution: throughput times the radiance reflected here, over the pixel's estimate. */
-static float guided_survival(const tr_worker *w, const tr_frame *frame, int id)
+/* Expected contribution of a path, throughput times the radiance reflected here, over the pixel's estimate; negative
+   where it is not known. */
+static float expectation(const tr_worker *w, const tr_frame *frame, int id)
 {
     const path *p = &w->paths[id];
     int k = w->place[id];
     if (k < 0 || !p->seen || !(w->reflected[k] > 0))
-        return 1;
+        return -1;
     const float *e = frame->estimate->data + 3 * ((size_t)p->y * (size_t)frame->width + (size_t)p->x);
     float pixel = (e[0] + e[1] + e[2]) * (1.0f / 3) + 0.25f * frame->estimate_floor;
-    float q = mean3(p->throughput) * w->reflected[k] / (ROULETTE_LOW * pixel);
-    return q < ROULETTE_MIN ? ROULETTE_MIN : q < 1 ? q : 1;
+    return mean3(p->throughput) * w->reflected[k] / pixel;
+}
+
+/* Let a path go on from this vertex as n paths, each with a share of 1 / n of what it would have been. */
+static void split_path(tr_worker *w, const tr_frame *frame, int id, int n, bool recording)
+{
+    size_t size = frame->method->handle_size;
+    int from = w->place[id], room = TR_PATHS - w->path_count;
+    n = n - 1 < room ? n : room + 1;
+    w->paths[id].roulette = 1 / (float)n;
+    for (int i = 1; i < n; ++i) {
+        int copy = w->path_count++, k = w->smooth_count++;
+        path *p = &w->paths[copy];
+        *p = w->paths[id];
+        uint64_t seed = (uint64_t)rng_u32(&w->paths[id].guide_rng) << 32 | rng_u32(&w->paths[id].guide_rng);
+        p->rng = rng_seed(seed, 0);
+        p->guide_rng = rng_seed(seed, 1);
+        p->join = p->last;
+        p->last = -1;
+        if (recording)
+            push_link(w, p);
+        w->surfaces[copy] = w->surfaces[id];
+        w->closures[copy] = w->closures[id];
+        w->place[copy] = k;
+        w->smooth[k] = copy;
+        w->alpha[k] = w->alpha[from];
+        memcpy((char *)w->handles + (size_t)k * size, (char *)w->handles + (size_t)from * size, size);
+        w->active[w->active_count++] = copy;
+    }
+    w->counters.split_paths += (uint64_t)(n - 1);
+}
+
+/* Paths that are expected to add little are ended by chance, paths that are expected to add much go on as several. */
+static void guided_roulette(tr_worker *w, const tr_frame *frame, bool recording)
+{
+    int kept = 0, count[TR_PATHS];
+    frame->method->reflected(frame->method_data, w->smooth_count, w->handles, w->reflected);
+    for (int i = 0; i < w->active_count; ++i) {
+        int id = w->active[i];
+        float e = expectation(w, frame, id), q = e < 0 ? 1 : e / ROULETTE_LOW;
+        q = q < ROULETTE_MIN ? ROULETTE_MIN : q < 1 ? q : 1;
+        w->paths[id].roulette = 1 / q;
+        if (q < 1 && rng_float(&w->paths[id].guide_rng) >= q)
+            continue;
+        count[kept] = e > ROULETTE_HIGH ? (int)ceilf(tr_min(e / ROULETTE_HIGH, ROULETTE_MOST)) : 1;
+        w->active[kept++] = id;
+    }
+    w->active_count = kept;
+    for (int i = 0; i < kept; ++i)
+        if (count[i] > 1)
+            split_path(w, frame, w->active[i], count[i], recording);
 }
 
 /* Paths that lose are dropped. */
-static void roulette(tr_worker *w, const tr_frame *frame, int depth)
+static void roulette(tr_worker *w, const tr_frame *frame, int depth, bool recording)
 {
     int kept = 0;
     tr_roulette mode = frame->settings->roulette;
-    bool guided = mode == TR_ROULETTE_GUIDED && frame->guiding && frame->estimate && frame->method->reflected &&
-                  w->smooth_count > 0;
-    if (guided)
-        frame->method->reflected(frame->method_data, w->smooth_count, w->handles, w->reflected);
-    else if (mode != TR_ROULETTE_THROUGHPUT)
+    if (mode == TR_ROULETTE_GUIDED && frame->guiding && frame->estimate && frame->method->reflected &&
+        w->smooth_count > 0)
+        guided_roulette(w, frame, recording);
+    if (mode != TR_ROULETTE_THROUGHPUT)
         return;
     for (int i = 0; i < w->active_count; ++i) {
         int id = w->active[i];
-        float q = guided ? guided_survival(w, frame, id) : throughput_survival(w, id, depth);
+        float q = throughput_survival(w, id, depth);
         w->paths[id].roulette = 1 / q;
-        if (q < 1 && rng_float(guided ? &w->paths[id].guide_rng : &w->paths[id].rng) >= q)
+        if (q < 1 && rng_float(&w->paths[id].rng) >= q)
             continue;
         w->active[kept++] = id;
     }
@@ -680,7 +742,7 @@ static inline bool follow(tr_worker *w, const tr_frame *frame, int id, const cho
 
 static void scatter(tr_worker *w, const tr_frame *frame, bool recording)
 {
-    choice choices[TR_BATCH];
+    choice choices[TR_PATHS];
     bool guiding = frame->guiding;
     if (guiding)
         choose_guided(w, frame, choices);
@@ -697,10 +759,11 @@ static void scatter(tr_worker *w, const tr_frame *frame, bool recording)
 
 /* ---- >>record ----------------------------------------------------------------------------------------------- */
 
-/* Walk each path from its end, so that a vertex knows the radiance its direction brought. */
-static void carry_back(tr_worker *w, int path_count)
+/* Walk each path from its end, so that a vertex knows the radiance its direction brought. Split ones come before what
+   they were split from: what they bring is reflected there. */
+static void carry_back(tr_worker *w)
 {
-    for (int id = 0; id < path_count; ++id) {
+    for (int id = w->path_count; id-- > 0;) {
         vec3 incident = v3s(0);
         const link *next = NULL;
         for (int at = w->paths[id].last; at >= 0; at = w->links[at].previous) {
@@ -716,12 +779,16 @@ static void carry_back(tr_worker *w, int path_count)
             incident = add3(l->emitted, add3(l->reflected, mul3(l->weight, incident)));
             next = l;
         }
+        if (w->paths[id].join >= 0) {
+            link *from = &w->links[w->paths[id].join];
+            from->reflected = add3(from->reflected, incident);
+        }
     }
 }
 
-static void deposit(tr_worker *w, const tr_frame *frame, int path_count)
+static void deposit(tr_worker *w, const tr_frame *frame, int camera_paths)
 {
-    for (int id = 0; id < path_count; ++id) {
+    for (int id = 0; id < camera_paths; ++id) {
         const path *p = &w->paths[id];
         size_t at = 3 * ((size_t)p->y * (size_t)frame->width + (size_t)p->x);
         if (!finite3(p->radiance)) {
@@ -739,7 +806,7 @@ static void deposit(tr_worker *w, const tr_frame *frame, int path_count)
 static void trace_batch(tr_worker *w, const tr_frame *frame, int tile, int sample, bool recording)
 {
     start_paths(w, frame, tile, sample);
-    int path_count = w->active_count;
+    int camera_paths = w->active_count;
     for (int depth = 0; w->active_count > 0 && depth < frame->max_depth; ++depth) {
         if (!reserve(w, recording)) {
             w->counters.out_of_memory = true;
@@ -753,13 +820,13 @@ static void trace_batch(tr_worker *w, const tr_frame *frame, int tile, int sampl
         describe_vertices(w, frame);
         if (frame->nee && w->smooth_count > 0 && frame->scene->light_count > 0)
             next_event(w, frame, recording);
-        roulette(w, frame, depth);
+        roulette(w, frame, depth, recording);
         scatter(w, frame, recording);
     }
-    deposit(w, frame, path_count);
+    deposit(w, frame, camera_paths);
     if (recording) {
         double start = tr_wall_seconds();
-        carry_back(w, path_count);
+        carry_back(w);
         if (!frame->method->record(frame->method_data, tile, w->vertices, w->vertex_count))
             w->counters.out_of_memory = true;
         w->counters.record += tr_wall_seconds() - start;

@@ -7,6 +7,7 @@
 #define TR_TILE_W 32
 #define TR_TILE_H 16
 #define TR_BATCH (TR_TILE_W * TR_TILE_H)
+#define TR_PATHS (4 * TR_BATCH) /* with those that are split off: where they run out, paths stay whole */
 
 /* What every tile of a pass shares. Pixels belong to one tile and a tile to one thread at a time: no locks. */
 typedef struct tr_frame {
@@ -33,7 +34,7 @@ typedef struct tr_frame {
 
 typedef struct tr_counters {
     double trace, record, query, total; /* seconds on the worker's clock */
-    uint64_t rays, shadow_rays, paths, bad_samples, guided_vertices, vertices;
+    uint64_t rays, shadow_rays, paths, bad_samples, guided_vertices, vertices, split_paths;
     bool out_of_memory;
 } tr_counters;
 
