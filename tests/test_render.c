@@ -1,7 +1,7 @@
 /* test_render.c: the integrator against the outside: analytic irradiance and furnaces, three estimators that must
    agree, guided against unguided, and bit-identical images for any number of threads.
 
-     >>tools >>analytic >>agree >>guided >>identical >>misuse */
+     >>tools >>analytic >>agree >>guided >>splitting >>identical >>misuse */
 #include "cmocka_prelude.h"
 #include "tracer.h"
 
@@ -314,6 +314,116 @@ static void guided_agrees_on_lamps(void **state) { (void)state, guided_agrees("l
 static void guided_agrees_on_pool(void **state) { (void)state, guided_agrees("pool", "sun_size", "40", 100, true); }
 static void guided_agrees_on_maze(void **state) { (void)state, guided_agrees("maze", "lamp_z", "-2.3", 100, true); }
 
+/* ---- >>splitting -------------------------------------------------------------------------------------------- */
+
+/* A method that guides evenly over the sphere and says what it likes of the reflected radiance; it adds up what the
+   first vertices of the paths receive. */
+typedef struct even_method {
+    float reflected;
+    double first, first_squares;
+    uint64_t first_count, count;
+} even_method;
+static even_method even;
+
+static void *even_create(tr_method_env *env, char *err, size_t err_size)
+{
+    return (void)env, (void)err, (void)err_size, &even;
+}
+static void even_destroy(void *method) { (void)method; }
+static void even_find(void *method, const tr_lookup *lookup, void *handles, float *alpha)
+{
+    (void)method;
+    for (int i = 0; i < lookup->n; ++i) {
+        ((float *)handles)[i] = 0.25f / TR_PI;
+        alpha[i] = 0.5f;
+    }
+}
+static void even_sample(void *method, int n, const int *index, const void *handles, const float (*u)[2], vec3 *wi,
+                        float *pdf)
+{
+    (void)method;
+    for (int i = 0; i < n; ++i) {
+        int k = index[i];
+        float z = 2 * u[k][0] - 1, r = sqrtf(1 - z * z), phi = 2 * TR_PI * u[k][1];
+        wi[k] = v3(r * cosf(phi), r * sinf(phi), z);
+        pdf[k] = ((const float *)handles)[k];
+    }
+}
+static void even_pdf(void *method, int n, const int *index, const void *handles, const vec3 *wi, float *pdf)
+{
+    (void)method, (void)wi;
+    for (int i = 0; i < n; ++i)
+        pdf[index[i]] = ((const float *)handles)[index[i]];
+}
+static void even_reflected(void *method, int n, const void *handles, float *radiance)
+{
+    (void)handles;
+    for (int i = 0; i < n; ++i)
+        radiance[i] = ((const even_method *)method)->reflected;
+}
+static bool even_record(void *method, int tile, const tr_vertex *vertices, int n)
+{
+    even_method *m = method;
+    (void)tile;
+    for (int i = 0; i < n; ++i) {
+        const tr_vertex *v = &vertices[i];
+        double brought = v->pdf_mix > 0 ? (double)(mean3(mul3(v->f, v->L)) * v->cosine / v->pdf_mix) : 0;
+        m->count++;
+        if (!(v->flags & TR_VERTEX_FIRST))
+            continue;
+        m->first += brought;
+        m->first_squares += brought * brought;
+        m->first_count++;
+    }
+    return true;
+}
+
+static const tr_method even_method_table = {.name = "even",
+                                            .handle_size = sizeof(float),
+                                            .create = even_create,
+                                            .destroy = even_destroy,
+                                            .find = even_find,
+                                            .sample = even_sample,
+                                            .pdf = even_pdf,
+                                            .reflected = even_reflected,
+                                            .record = even_record,
+                                            .wants_pixel_estimate = true};
+
+/* Split wherever that is possible, or never: the same picture, and records that say the same of what first vertices
+   receive. */
+static void splitting_changes_no_mean(void **state)
+{
+    (void)state;
+    tr_scene *scene = load("gloss", "bulb", "0.3");
+    tr_settings s = small("pt", SPP(64));
+    tr_result r[2];
+    even_method m[2];
+    s.method = &even_method_table;
+    s.threads = 1; /* one sum for all tiles */
+    for (int split = 0; split < 2; ++split) {
+        memset(&even, 0, sizeof even);
+        even.reflected = split ? 1e6f : 0;
+        s.seed = (uint64_t)split;
+        r[split] = render(scene, &s);
+        m[split] = even;
+    }
+    assert_int_equal(r[0].split_paths, 0);
+    assert_true(r[1].split_paths > r[1].paths); /* the first pass has no pixel estimate to compare with */
+    assert_true(m[1].count > m[0].count + r[1].split_paths / 2);
+    assert_agree("whole and split", &r[0], &r[1]);
+    double mean[2], variance = 0;
+    for (int k = 0; k < 2; ++k) {
+        double n = (double)m[k].first_count;
+        mean[k] = m[k].first / n;
+        variance += (m[k].first_squares / n - mean[k] * mean[k]) / n;
+        tr_result_free(&r[k]);
+    }
+    print_message("first vertices receive %.5f whole, %.5f split: z %.2f\n", mean[0], mean[1],
+                  (mean[1] - mean[0]) / sqrt(variance));
+    assert_true(fabs(mean[1] - mean[0]) < 3.5 * sqrt(variance));
+    tr_scene_free(scene);
+}
+
 /* ---- >>identical -------------------------------------------------------------------------------------------- */
 
 static void same_for_threads(const char *method)
@@ -400,6 +510,7 @@ int main(void)
         cmocka_unit_test(guided_agrees_on_lamps),
         cmocka_unit_test(guided_agrees_on_pool),
         cmocka_unit_test(guided_agrees_on_maze),
+        cmocka_unit_test(splitting_changes_no_mean),
         cmocka_unit_test(pt_is_identical_for_any_threads),
         cmocka_unit_test(sdtree_is_identical_for_any_threads),
         cmocka_unit_test(closed_gate_changes_no_bit),

@@ -528,7 +528,7 @@ static float expectation(const tr_worker *w, const tr_frame *frame, int id)
 /* Let a path go on from this vertex as n paths, each with a share of 1 / n of what it would have been. */
 static void split_path(tr_worker *w, const tr_frame *frame, int id, int n, bool recording)
 {
-    size_t size = frame->method->handle_size;
+    const tr_method *method = frame->method;
     int from = w->place[id], room = TR_PATHS - w->path_count;
     n = n - 1 < room ? n : room + 1;
     w->paths[id].roulette = 1 / (float)n;
@@ -548,7 +548,12 @@ static void split_path(tr_worker *w, const tr_frame *frame, int id, int n, bool 
         w->place[copy] = k;
         w->smooth[k] = copy;
         w->alpha[k] = w->alpha[from];
-        memcpy((char *)w->handles + (size_t)k * size, (char *)w->handles + (size_t)from * size, size);
+        char *to = (char *)w->handles + (size_t)k * method->handle_size;
+        const char *handle = (const char *)w->handles + (size_t)from * method->handle_size;
+        if (method->copy_handle)
+            method->copy_handle(to, handle);
+        else
+            memcpy(to, handle, method->handle_size);
         w->active[w->active_count++] = copy;
     }
     w->counters.split_paths += (uint64_t)(n - 1);

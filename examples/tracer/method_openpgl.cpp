@@ -39,7 +39,8 @@ const size_t most_samples = (size_t)1 << 22;
 /* A lookup's slot. Slots are the workers' memory, zero at first and never handed back: the distribution stays with its
    slot, for it is large and slow to allocate, and the method frees it. */
 struct slot {
-    pgl::SurfaceSamplingDistribution *distribution;
+    pgl::SurfaceSamplingDistribution *own,
+        *distribution; /* its own, and the one to ask: where a path was split, another's */
     float reflected;
 };
 
@@ -341,17 +342,17 @@ bool idle(void *data) { return static_cast<method *>(data)->updates == 0; }
 
 pgl::SurfaceSamplingDistribution *of_slot(method *m, slot *s)
 {
-    if (!s->distribution)
+    if (!s->own)
         try {
             std::unique_ptr<pgl::SurfaceSamplingDistribution> made(
                 new pgl::SurfaceSamplingDistribution(m->field.get()));
             std::lock_guard<std::mutex> hold(m->pool_lock);
             m->pool.push_back(std::move(made));
-            s->distribution = m->pool.back().get();
+            s->own = m->pool.back().get();
         } catch (const std::exception &) {
             return nullptr; /* unguided then */
         }
-    return s->distribution;
+    return s->distribution = s->own;
 }
 
 void find(void *data, const tr_lookup *lookup, void *handles, float *alpha)
@@ -367,6 +368,13 @@ void find(void *data, const tr_lookup *lookup, void *handles, float *alpha)
         slots[i].reflected = m->reflected->mean[m->reflected->box_of(lookup->p[i])];
         alpha[i] = found ? m->alpha : 1;
     }
+}
+
+void copy_handle(void *to, const void *from)
+{
+    slot *s = static_cast<slot *>(to);
+    s->distribution = static_cast<const slot *>(from)->distribution;
+    s->reflected = static_cast<const slot *>(from)->reflected;
 }
 
 void reflected(void *, int n, const void *handles, float *radiance)
@@ -439,6 +447,7 @@ tr_method describe_method()
     t.find = find;
     t.sample = sample;
     t.pdf = pdf_of;
+    t.copy_handle = copy_handle;
     t.reflected = reflected;
     t.wants_pixel_estimate = true; /* that roulette compares with */
     t.record = record;

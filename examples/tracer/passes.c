@@ -479,6 +479,7 @@ static bool collect(render_state *r)
         sum.rays += c->rays;
         sum.shadow_rays += c->shadow_rays;
         sum.paths += c->paths;
+        sum.split_paths += c->split_paths;
         sum.bad_samples += c->bad_samples;
         sum.out_of_memory |= c->out_of_memory;
     }
@@ -491,6 +492,7 @@ static bool collect(render_state *r)
     res->rays = sum.rays;
     res->shadow_rays = sum.shadow_rays;
     res->paths = sum.paths;
+    res->split_paths = sum.split_paths;
     res->bad_samples = sum.bad_samples;
     double total = 0;
     for (int i = 0; i < r->group_count; ++i)

@@ -36,7 +36,8 @@ static const char usage_text[] =
     "  --size WxH            picture size (default: the scene's)\n"
     "  --max-depth D         path edges, 1 = emitted light only (default: the scene's)\n"
     "  --nee on|off          next event estimation (default on)\n"
-    "  --rr guided|off|on    Russian roulette: by what the guide expects (default; pt: off), none, by throughput\n"
+    "  --rr guided|off|on    Russian roulette: by what the guide expects, with splitting (default; pt: off), none, by\n"
+    "                        throughput\n"
     "  --seed N, --threads N\n"
     "  -D name=value         value for $name in the scene file (repeatable)\n"
     "  --reference R.exr     print errors against R; R may be larger by a whole factor\n"
@@ -246,6 +247,7 @@ static bool write_json(const char *path, const options *o, const tr_result *r, c
     json_number(f, "rays", (double)r->rays);
     json_number(f, "shadow_rays", (double)r->shadow_rays);
     json_number(f, "paths", (double)r->paths);
+    json_number(f, "split_paths", (double)r->split_paths);
     json_number(f, "bad_samples", (double)r->bad_samples);
     json_number(f, "samples", (double)r->method.samples);
     json_number(f, "refused", (double)r->method.refused);

@@ -468,9 +468,10 @@ typedef struct tr_method_stats {
     char json[2048];    /* method-specific members, without braces; may be empty */
 } tr_method_stats;
 
-/* A guiding method. Handles are plain data of handle_size bytes, found once a vertex and asked many times. Every
-   function but find, sample, pdf and record (one stream per thread at a time) is called by one thread. NULL entries are
-   allowed everywhere but create and destroy: a method without find never guides. */
+/* A guiding method. Handles have handle_size bytes, zero at first; they are found once a vertex, asked many times and
+   copied where a path splits. Every function but find, sample, pdf and record (one stream per thread at a time) is
+   called by one thread. NULL entries are allowed everywhere but create and destroy: a method without find never guides.
+ */
 typedef struct tr_method {
     const char *name, *summary;
     size_t handle_size;
@@ -487,6 +488,8 @@ typedef struct tr_method {
                    float *pdf);
     /* Density of wi[index[i]] under handles[index[i]], to pdf[index[i]]. */
     void (*pdf)(void *method, int n, const int *index, const void *handles, const vec3 *wi, float *pdf);
+    /* Make `to` as good as `from`, which find filled, until find fills it again; NULL = a copy of its bytes is. */
+    void (*copy_handle)(void *to, const void *from);
     /* Mean radiance that the surface at each handle's vertex reflects, to radiance[i]; 0 = not known yet. */
     void (*reflected)(void *method, int n, const void *handles, float *radiance);
     bool (*record)(void *method, int tile, const tr_vertex *vertices, int n); /* false = out of memory */
@@ -506,8 +509,9 @@ const tr_method *const *tr_method_list(void);      /* NULL-terminated */
 
 /* ---- >>render ----------------------------------------------------------------------------------------------- */
 
-/* Guided roulette compares what a vertex is expected to add with what its pixel needs (Vorba and Krivanek 2016); it
-   asks the method, and is off where the method cannot tell. Throughput: the product of albedos, from the 5th edge on.
+/* Guided roulette compares what a vertex is expected to add with what its pixel needs (Vorba and Krivanek 2016): paths
+   that promise little are ended by chance, paths that promise much go on as several. It asks the method, and is off
+   where the method cannot tell. Throughput: the product of albedos, from the 5th edge on.
  */
 typedef enum tr_roulette { TR_ROULETTE_GUIDED, TR_ROULETTE_OFF, TR_ROULETTE_THROUGHPUT } tr_roulette;
 
@@ -536,6 +540,7 @@ typedef struct tr_result {
     double cpu_seconds, wall_seconds;
     double trace_seconds, record_seconds, update_seconds, query_seconds; /* CPU seconds, of which shading is the rest */
     uint64_t rays, shadow_rays, paths;
+    uint64_t split_paths; /* that guided roulette added */
     uint64_t bad_samples; /* NaN or infinite contributions dropped */
     tr_method_stats method;
     struct tr_pass_result {
