@@ -444,7 +444,7 @@ static int plan_pass(const render_state *r, int limit, bool *last)
         return *last ? left : spp;
     }
     double left = r->settings->seconds - cpu_used(r);
-    *last = r->frozen || (r->result->passes > 0 && r->cost * spp >= left);
+    *last = r->frozen || (r->cost > 0 && r->cost * spp >= left);
     return *last ? 1 << 24 : spp;
 }
 
