@@ -5,6 +5,7 @@
 #   make             build only           make bench       run the microbenchmarks
 #   make bench-readme                     put the last bench's figures into the README
 #   make bench-error [PRESET=quick|full]  error against run time: tables and plots in out/bench-error-PRESET
+#   make bench-error PRESET=denoise       trained and then frozen fields: not denoised, after and during the training
 #   make stress      hostile and extreme input for every header, STRESS_SECONDS=30 STRESS_SEED=1 STRESS_ONLY=group
 #                    STRESS_CASES=50: so many cases a group instead, the same on every machine
 #   make format      clang-format in place  make lint        only check
@@ -291,6 +292,9 @@ PRESET ?= quick
 PRESET_quick := --scenes ajar,lamps,torus,pool,cornell --seconds 5,20
 PRESET_full = --scenes $(shell cd examples/scenes 2>/dev/null && ls *.xml | sed 's/\.xml//' | \
 	paste -sd, -)$(if $(GUIDE_SCENES),$(comma)veach-ajar$(comma)veach-bidir$(comma)living-room$(comma)kitchen) --seconds 10,30,60
+# The protocol of Nilsson's thesis on denoising (chapter 5): 3 trainings, then 512 samples per pixel, every scene.
+PRESET_denoise = $(firstword $(PRESET_full)) $(word 2,$(PRESET_full)) --size 160x90 --train 8,32,128 --spp 512 --seeds 3 \
+	--methods sdtree:denoise=off,sdtree:denoise_when=last,sdtree
 comma := ,
 
 bench-error: deps

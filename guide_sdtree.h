@@ -282,6 +282,10 @@ typedef struct gsd_training_sample {
 typedef struct gsd_pass {
     bool pixel_estimate;      /* the pass's pixel_contributions were relative to a pixel estimate: see Gate */
     gsd_denoise_mode denoise; /* of this refine, in place of desc.denoise */
+    /* Told as each step of refine begins, by the thread that called it: "measure", "denoise", "split", "build", and
+       NULL when all is done (not after a failure). For measuring where the time goes; NULL = nobody is told. */
+    void (*on_step)(void *user, const char *step);
+    void *on_step_user;
 } gsd_pass;
 
 typedef void (*gsd_range_fn)(void *context, uint32_t begin, uint32_t end);
@@ -2394,6 +2398,7 @@ typedef struct gsdi_place {
 typedef struct gsdi_refinement {
     gsd_field *field;
     const gsd_desc *desc;
+    const gsd_pass *pass; /* or NULL */
     bool second_moment, clear;
     gsd_target target; /* of the next pass */
     gsd_denoise_mode denoise;
@@ -2441,6 +2446,12 @@ static uint64_t gsdi_bytes(const gsdi_block *b, uint64_t building_nodes)
 {
     return b->size + 64 + building_nodes * (sizeof(uint32_t) + sizeof(gsdi_sum)) + b->cells * sizeof(gsdi_state) +
            sizeof(gsd_field);
+}
+
+static void gsdi_step(const gsdi_refinement *r, const char *step)
+{
+    if (r->pass && r->pass->on_step)
+        r->pass->on_step(r->pass->on_step_user, step);
 }
 
 /* Masses of the old cells' building trees; whether to rebuild. */
@@ -2878,6 +2889,7 @@ static uint32_t gsdi_refine_plan(gsdi_refinement *r, gsd_parallel_fn parallel, v
     uint32_t old = field->block->cells, i;
     uint64_t total;
     bool fits;
+    gsdi_step(r, "measure");
     r->jobs = (gsdi_job *)gsdi_allocate(r->desc, old, sizeof *r->jobs);
     r->mass = (double *)gsdi_allocate(r->desc, field->building_nodes, sizeof(double));
     r->depth = (unsigned char *)gsdi_allocate(r->desc, field->building_nodes, 1);
@@ -2890,8 +2902,10 @@ static uint32_t gsdi_refine_plan(gsdi_refinement *r, gsd_parallel_fn parallel, v
         r->stats.waiting_cells += !r->jobs[i].rebuild && s->fresh > 0;
         r->stats.unread_cells += !(s->fresh > 0);
     }
+    gsdi_step(r, "denoise");
     if (!gsdi_denoise(r, parallel, user))
         return 0;
+    gsdi_step(r, "split");
     r->shape = *field->block;
     r->cell_limit = gsdi_cell_limit(r->desc);
     r->needs = (gsdi_need *)gsdi_allocate(r->desc, (uint64_t)old + 1, sizeof *r->needs);
@@ -3004,6 +3018,7 @@ GSD_API gsd_result gsd_refine(gsd_field *field, const gsd_pass *pass, gsd_parall
     memset(&r, 0, sizeof r);
     r.field = field;
     r.desc = &field->desc;
+    r.pass = pass;
     r.denoise = pass && pass->denoise ? pass->denoise : r.desc->denoise;
     if ((unsigned)r.denoise > GSD_DENOISE_BLUR)
         return GSD_BAD_OPTION;
@@ -3021,6 +3036,7 @@ GSD_API gsd_result gsd_refine(gsd_field *field, const gsd_pass *pass, gsd_parall
         return GSD_OUT_OF_MEMORY;
     }
     /* nothing can fail from here */
+    gsdi_step(&r, "build");
     gsdi_judge_cells(&r, pass, samples);
     gsdi_block_uniform(r.block);
     memcpy(gsdi_words(r.block, r.block->spatial_at), r.spatial, r.spatial_count * sizeof(uint32_t));
@@ -3029,6 +3045,7 @@ GSD_API gsd_result gsd_refine(gsd_field *field, const gsd_pass *pass, gsd_parall
     gsdi_run(parallel, user, r.cells, 16, gsdi_write_cells, &r);
     memcpy((char *)r.block + r.block->trees_at, r.trees, r.tree_count * sizeof(gsdi_tree));
     gsdi_refine_commit(&r, nodes, samples);
+    gsdi_step(&r, NULL);
     return GSD_OK;
 }
 

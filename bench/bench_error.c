@@ -27,6 +27,7 @@ static const char usage[] =
     "  --methods a,b:k=v    methods with their options; the first is what the others are compared with (pt,sdtree)\n"
     "  --seconds 10,30,60   budgets in CPU seconds, learning included, loading of the scene not (default 10,30), or\n"
     "  --spp 16,64          budgets in samples per pixel\n"
+    "  --train 8,32         before each: samples per pixel after which the field is frozen; counted in --seconds only\n"
     "  --seeds N            (3)      --size WxH (320x180)      --max-depth D (13)      --nee on|off (on)\n"
     "  --builds a=f,b=g     renderers to compare, names and files (default: the one next to this program)\n"
     "  --references DIR     where NAME.exr are; else examples/scenes/references, then out/references\n"
@@ -38,6 +39,7 @@ static const char usage[] =
 
 typedef struct options {
     plan plan;
+    names amounts, trainings; /* which make the plan's budgets */
     char build_paths[MAX_NAMES][512];
     const char *size, *references, *nee;
     int max_depth, jobs;
@@ -66,21 +68,53 @@ static bool split(const char *text, names *out)
     return out->count > 0;
 }
 
-static bool set_budgets(options *o, const char *text, bool by_spp)
+/* Numbers greater than 0, each written in one way only: rows are found by their budgets' texts. */
+static bool set_numbers(names *out, const char *text, bool whole)
 {
-    names numbers;
-    if (!split(text, &numbers))
+    if (!split(text, out))
         return false;
-    o->by_spp = by_spp;
-    o->plan.budgets.count = numbers.count;
-    for (int i = 0; i < numbers.count; ++i) {
+    for (int i = 0; i < out->count; ++i) {
         char *end;
-        double value = strtod(numbers.at[i], &end);
-        if (*end || end == numbers.at[i] || !(value > 0) || !(value < 1e7) || (by_spp && value != floor(value)))
+        double value = strtod(out->at[i], &end);
+        if (*end || end == out->at[i] || !(value > 0) || !(value < 1e6) || (whole && value != floor(value)))
             return false;
-        snprintf(o->plan.budgets.at[i], sizeof o->plan.budgets.at[i], "%g%s", value, by_spp ? "spp" : "s");
+        snprintf(out->at[i], sizeof out->at[i], "%g", value);
     }
     return true;
+}
+
+static bool set_amounts(options *o, const char *text, bool by_spp)
+{
+    o->by_spp = by_spp;
+    return set_numbers(&o->amounts, text, by_spp);
+}
+
+/* Every training with every amount: "10s", "64spp", "8+64spp". */
+static bool combine_budgets(options *o)
+{
+    names *b = &o->plan.budgets;
+    const char *unit = o->by_spp ? "spp" : "s";
+    o->plan.trained = o->trainings.count > 0;
+    b->count = 0;
+    for (int a = 0; a < o->amounts.count; ++a)
+        for (int t = 0; t < (o->plan.trained ? o->trainings.count : 1); ++t) {
+            if (b->count == MAX_NAMES)
+                return false;
+            char text[40];
+            if (o->plan.trained)
+                snprintf(text, sizeof text, "%.10s+%.10s%s", o->trainings.at[t], o->amounts.at[a], unit);
+            else
+                snprintf(text, sizeof text, "%.10s%s", o->amounts.at[a], unit);
+            strcpy(b->at[b->count++], text);
+        }
+    return true;
+}
+
+/* What comes after the training. */
+static const char *amount_of(const char *budget)
+{
+    const char *plus = strchr(budget, '+');
+    return plus ? plus + 1 : budget;
 }
 
 static bool set_builds(options *o, const char *text)
@@ -116,9 +150,11 @@ static bool apply(options *o, const char *name, const char *value, bool *known)
     if (!strcmp(name, "--methods"))
         return split(value, &o->plan.methods);
     if (!strcmp(name, "--seconds"))
-        return set_budgets(o, value, false);
+        return set_amounts(o, value, false);
     if (!strcmp(name, "--spp"))
-        return set_budgets(o, value, true);
+        return set_amounts(o, value, true);
+    if (!strcmp(name, "--train"))
+        return set_numbers(&o->trainings, value, true);
     if (!strcmp(name, "--builds"))
         return set_builds(o, value);
     if (!strcmp(name, "--seeds"))
@@ -154,7 +190,7 @@ static int parse(options *o, int argc, char **argv)
 {
     split("ajar,cornell", &o->plan.scenes);
     split("pt,sdtree", &o->plan.methods);
-    set_budgets(o, "10,30", false);
+    set_amounts(o, "10,30", false);
     default_build(o, argv[0]);
     for (int i = 1; i < argc; ++i) {
         bool known;
@@ -173,6 +209,8 @@ static int parse(options *o, int argc, char **argv)
         }
         ++i;
     }
+    if (!combine_budgets(o))
+        return die("too many budgets", NULL);
     for (int i = 0; i < o->plan.builds.count; ++i)
         if (access(o->build_paths[i], X_OK))
             return die("no such renderer; build it with `make`, or name it with --builds", o->build_paths[i]);
@@ -250,6 +288,13 @@ static int index_of(const names *n, const char *name)
     return 0;
 }
 
+/* A method that does not learn renders without a training. */
+static bool trains(const options *o, const char *method)
+{
+    const tr_method *m = tr_method_find(method);
+    return o->plan.trained && (!m || m->learns);
+}
+
 /* The words of a renderer's command line; `text` holds those that are made here. */
 static int command_line(const options *o, const row *r, const char *scene, char text[][1024], char **argv)
 {
@@ -263,7 +308,7 @@ static int command_line(const options *o, const row *r, const char *scene, char 
     picture_path(text[2], 1024, o->plan.out, "pictures", r, ".exr");
     picture_path(text[3], 1024, o->plan.out, "pictures", r, ".json");
     snprintf(text[4], 1024, "%d", r->seed);
-    snprintf(text[5], 1024, "%.*s", (int)strcspn(r->budget, "sp"), r->budget);
+    snprintf(text[5], 1024, "%.*s", (int)strcspn(amount_of(r->budget), "sp"), amount_of(r->budget));
     snprintf(text[6], 1024, "%d", o->max_depth);
     snprintf(text[7], 1024, "%s", scene);
     const char *words[] = {o->build_paths[index_of(&o->plan.builds, r->build)],
@@ -289,6 +334,11 @@ static int command_line(const options *o, const row *r, const char *scene, char 
                            "--quiet"};
     for (size_t i = 0; i < sizeof words / sizeof words[0]; ++i)
         argv[n++] = (char *)words[i];
+    if (trains(o, at)) {
+        snprintf(text[8], 1024, "%.*s", (int)strcspn(r->budget, "+"), r->budget);
+        argv[n++] = (char *)"--train";
+        argv[n++] = text[8];
+    }
     while (more && n < 60) {
         char *key = end + 1;
         end = key + strcspn(key, ":");
@@ -307,7 +357,7 @@ static int command_line(const options *o, const row *r, const char *scene, char 
 
 static bool start(const options *o, child *c, const row *task)
 {
-    static char text[8][1024];
+    static char text[9][1024];
     char scene[1024], log[1024];
     char *argv[64];
     c->row = *task;
@@ -317,7 +367,7 @@ static bool start(const options *o, child *c, const row *task)
     command_line(o, task, scene, text, argv);
     picture_path(log, sizeof log, o->plan.out, "pictures", task, ".log");
     unlink(text[3]); /* an old one is not this run's */
-    double seconds = o->by_spp ? 3600 : atof(task->budget);
+    double seconds = o->by_spp ? 3600 : atof(amount_of(task->budget));
     c->deadline = wall() + 120 + 20 * seconds;
     fflush(NULL);
     c->pid = fork();
@@ -480,15 +530,16 @@ static int report(const options *o, plan *p, const rows *all)
     FILE *f = open_in(p->out, "table.md");
     if (!f)
         return 1;
-    write_table(f, p, all);
+    write_tables(f, p, all);
     fclose(f);
-    write_table(stdout, p, all);
+    write_tables(stdout, p, all);
     printf("\nPictures against the first method's (|z| of all and of the worst 16x16 tile):\n");
     for (int s = 0; s < p->scenes.count; ++s) {
         plot_scene(p, all, p->scenes.at[s], false);
         plot_scene(p, all, p->scenes.at[s], true);
         compare_methods(stdout, p, all, p->scenes.at[s]);
     }
+    plot_overall(p, all);
     plot_cost(p, all);
     if (p->builds.count > 1)
         printf("\nBuilds:\n");
@@ -527,7 +578,7 @@ static void plan_text(const options *o, const rows *tasks)
 {
     double seconds = 0;
     for (int i = 0; i < tasks->count; ++i)
-        seconds += o->by_spp ? 0 : atof(tasks->at[i].budget);
+        seconds += o->by_spp ? 0 : atof(amount_of(tasks->at[i].budget));
     fprintf(stderr, "%d renders to do", tasks->count);
     if (seconds > 0)
         fprintf(stderr, ", %.0f CPU seconds, at least %.0f minutes with %d at a time", seconds,

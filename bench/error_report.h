@@ -21,6 +21,7 @@ typedef struct names {
 typedef struct plan {
     names scenes, builds, methods, budgets;
     int seeds;
+    bool trained; /* budgets name a training: plots show the error against it */
     const char *out;
 } plan;
 
@@ -76,6 +77,9 @@ static double value_relmse(const row *r) { return r->relmse; }
 static double value_mrae(const row *r) { return r->mrae; }
 static double value_spp(const row *r) { return r->spp; }
 static double value_seconds(const row *r) { return r->cpu_seconds; }
+static double value_train_spp(const row *r) { return r->train_spp; }
+static double value_train_seconds(const row *r) { return r->train_seconds; }
+static double value_denoise(const row *r) { return 100 * r->denoise_seconds / r->train_seconds; }
 static double value_speed(const row *r) { return r->spp / r->cpu_seconds; }
 static double value_efficiency(const row *r) { return 1 / (r->relmse * r->cpu_seconds); }
 
@@ -108,6 +112,41 @@ static estimate ratio_of(const plan *p, const rows *all, const char *scene, colu
             values[n++] = of(ra) / of(rb);
     }
     return geometric(values, n);
+}
+
+/* Over several scenes; their number is mean.count. */
+typedef struct overall {
+    estimate mean;
+    double lowest, highest; /* scene */
+} overall;
+
+/* Of column a over column b, all scenes together: geometric mean of the scenes' ratios. The interval is that of chance
+   between seeds, for these scenes: the variances of the scenes' means add up, degrees of freedom by Welch and
+   Satterthwaite. */
+static overall overall_ratio(const plan *p, const rows *all, column a, column b, const char *budget, row_value of)
+{
+    overall o = {{(double)NAN, (double)NAN, (double)NAN, 0}, (double)INFINITY, 0};
+    double sum = 0, variance = 0, degrees = 0;
+    for (int s = 0; s < p->scenes.count; ++s) {
+        estimate e = ratio_of(p, all, p->scenes.at[s], a, b, budget, of);
+        if (!e.count)
+            continue;
+        double error = log(e.high / e.low) / (2 * student(e.count - 1)); /* NaN with one seed: no interval then */
+        sum += log(e.value);
+        variance += error * error;
+        degrees += error * error * error * error / (e.count - 1);
+        o.lowest = fmin(o.lowest, e.value);
+        o.highest = fmax(o.highest, e.value);
+        o.mean.count++;
+    }
+    if (!o.mean.count)
+        return o;
+    double mean = sum / o.mean.count, error = sqrt(variance) / o.mean.count;
+    degrees = degrees > 0 ? variance * variance / degrees : 1; /* >= 1, but for rounding */
+    o.mean.value = exp(mean);
+    o.mean.low = exp(mean - student((int)(degrees + 1e-6)) * error);
+    o.mean.high = exp(mean + student((int)(degrees + 1e-6)) * error);
+    return o;
 }
 
 /* ---- bias: do two methods' pictures agree? */
@@ -272,7 +311,7 @@ static void print_ratio(FILE *f, estimate e)
 {
     if (!isfinite(e.value))
         fputs(" - |", f);
-    else if (e.count > 1)
+    else if (isfinite(e.low))
         fprintf(f, " %.3f (%.3f .. %.3f) |", e.value, e.low, e.high);
     else
         fprintf(f, " %.3f |", e.value);
@@ -297,9 +336,10 @@ static void write_table(FILE *f, const plan *p, const rows *all)
 {
     static column columns[MAX_NAMES * MAX_NAMES];
     int n = columns_of(p, columns);
-    fputs("| scene | budget | method | spp | CPU s | relMSE | ratio (95 %) | MRAE | efficiency |\n"
-          "|---|---|---|---|---|---|---|---|---|\n",
-          f);
+    fputs(
+        "| scene | budget | method | spp | CPU s | learning s | denoise | relMSE | ratio (95 %) | MRAE | efficiency |\n"
+        "|---|---|---|---|---|---|---|---|---|---|---|\n",
+        f);
     for (int s = 0; s < p->scenes.count; ++s)
         for (int b = 0; b < p->budgets.count; ++b)
             for (int c = 0; c < n; ++c) {
@@ -309,6 +349,8 @@ static void write_table(FILE *f, const plan *p, const rows *all)
                 fprintf(f, "| %s | %s | %s |", scene, budget, text);
                 print_estimate(f, mean_of(p, all, scene, columns[c], budget, value_spp), "%.0f");
                 print_estimate(f, mean_of(p, all, scene, columns[c], budget, value_seconds), "%.1f");
+                print_estimate(f, mean_of(p, all, scene, columns[c], budget, value_train_seconds), "%.2f");
+                print_estimate(f, mean_of(p, all, scene, columns[c], budget, value_denoise), "%.2f %%");
                 print_estimate(f, mean_of(p, all, scene, columns[c], budget, value_relmse), "%.4g");
                 print_ratio(f, ratio_of(p, all, scene, columns[c], columns[0], budget, value_relmse));
                 print_estimate(f, mean_of(p, all, scene, columns[c], budget, value_mrae), "%.4g");
@@ -317,10 +359,58 @@ static void write_table(FILE *f, const plan *p, const rows *all)
             }
 }
 
+/* Largest of the scenes' means of a column. */
+static estimate most(const plan *p, const rows *all, column c, const char *budget, row_value of)
+{
+    estimate e = {(double)NAN, (double)NAN, (double)NAN, 0};
+    for (int s = 0; s < p->scenes.count; ++s)
+        e.value = fmax(e.value, mean_of(p, all, p->scenes.at[s], c, budget, of).value);
+    return e;
+}
+
+/* What the scenes say together. */
+static void write_overall(FILE *f, const plan *p, const rows *all)
+{
+    static column columns[MAX_NAMES * MAX_NAMES];
+    int n = columns_of(p, columns);
+    fprintf(f,
+            "\nRatios to `%s`, geometric means over scenes (95 %% for these scenes):\n\n"
+            "| budget | method | scenes | relMSE | lowest | highest | MRAE | CPU s | denoise, most |\n"
+            "|---|---|---|---|---|---|---|---|---|\n",
+            columns[0].method);
+    for (int b = 0; b < p->budgets.count; ++b)
+        for (int c = 1; c < n; ++c) {
+            const char *budget = p->budgets.at[b];
+            char text[200];
+            label(text, sizeof text, p, columns[c]);
+            overall o = overall_ratio(p, all, columns[c], columns[0], budget, value_relmse);
+            fprintf(f, "| %s | %s | %d |", budget, text, o.mean.count);
+            print_ratio(f, o.mean);
+            print_estimate(f, (estimate){o.lowest, 0, 0, 1}, "%.3f");
+            print_estimate(f, (estimate){o.highest, 0, 0, 1}, "%.3f");
+            print_ratio(f, overall_ratio(p, all, columns[c], columns[0], budget, value_mrae).mean);
+            print_ratio(f, overall_ratio(p, all, columns[c], columns[0], budget, value_seconds).mean);
+            print_estimate(f, most(p, all, columns[c], budget, value_denoise), "%.2f %%");
+            fputc('\n', f);
+        }
+}
+
+/* Denoise: CPU seconds of that step over all that were spent until the method had learned for the last time. */
+static void write_tables(FILE *f, const plan *p, const rows *all)
+{
+    write_table(f, p, all);
+    fputs("\nlearning s: CPU seconds until the last update; denoise: its step's share of them\n", f);
+    if (p->methods.count * p->builds.count > 1)
+        write_overall(f, p, all);
+}
+
 /* ---- plots */
 
 static void plot_scene(const plan *p, const rows *all, const char *scene, bool by_spp)
 {
+    const char *kind = !by_spp ? "seconds" : p->trained ? "train" : "spp";
+    const char *axis = !by_spp ? "CPU seconds" : p->trained ? "samples per pixel of the training" : "samples per pixel";
+    row_value of = !by_spp ? value_seconds : p->trained ? value_train_spp : value_spp;
     static column columns[MAX_NAMES * MAX_NAMES];
     static double x[MAX_NAMES][MAX_NAMES], y[MAX_NAMES][MAX_NAMES];
     static char labels[MAX_NAMES][200];
@@ -332,21 +422,46 @@ static void plot_scene(const plan *p, const rows *all, const char *scene, bool b
     for (int c = 0; c < n; ++c) {
         label(labels[c], sizeof labels[c], p, columns[c]);
         for (int b = 0; b < p->budgets.count; ++b) {
-            x[c][b] = mean_of(p, all, scene, columns[c], p->budgets.at[b], by_spp ? value_spp : value_seconds).value;
+            x[c][b] = mean_of(p, all, scene, columns[c], p->budgets.at[b], of).value;
             y[c][b] = mean_of(p, all, scene, columns[c], p->budgets.at[b], value_relmse).value;
         }
         series[c] = (plot_series){labels[c], x[c], y[c], p->budgets.count, false};
     }
-    snprintf(path, sizeof path, "%s/error-%s-%s.svg", p->out, by_spp ? "spp" : "seconds", scene);
-    snprintf(title, sizeof title, "%s: error against %s", scene, by_spp ? "samples per pixel" : "CPU seconds");
-    plot_write(path, title, by_spp ? "samples per pixel" : "CPU seconds", "relMSE", series, n, true, true);
+    snprintf(path, sizeof path, "%s/error-%s-%s.svg", p->out, kind, scene);
+    snprintf(title, sizeof title, "%s: error against %s", scene, axis);
+    plot_write(path, title, axis, "relMSE", series, n, true, true);
+}
+
+/* Errors over the first column's, all scenes together. */
+static void plot_overall(const plan *p, const rows *all)
+{
+    static column columns[MAX_NAMES * MAX_NAMES];
+    static double x[MAX_NAMES], y[MAX_NAMES][MAX_NAMES];
+    static char labels[MAX_NAMES][200];
+    plot_series series[MAX_NAMES];
+    char path[1024], title[300];
+    int n = columns_of(p, columns);
+    if (n > MAX_NAMES)
+        n = MAX_NAMES;
+    for (int b = 0; b < p->budgets.count; ++b)
+        x[b] = atof(p->budgets.at[b]); /* the training, where there is one */
+    for (int c = 0; c < n; ++c) {
+        label(labels[c], sizeof labels[c], p, columns[c]);
+        for (int b = 0; b < p->budgets.count; ++b)
+            y[c][b] = overall_ratio(p, all, columns[c], columns[0], p->budgets.at[b], value_relmse).mean.value;
+        series[c] = (plot_series){labels[c], x, y[c], p->budgets.count, c == 0};
+    }
+    snprintf(path, sizeof path, "%s/overall.svg", p->out);
+    snprintf(title, sizeof title, "relMSE over that of %s, geometric mean of the scenes", columns[0].method);
+    plot_write(path, title, p->trained ? "samples per pixel of the training" : "budget", "relMSE ratio", series, n,
+               true, false);
 }
 
 /* Stacked bars: where the CPU seconds of the largest budget went. */
 static bool plot_cost(const plan *p, const rows *all)
 {
-    static const char *const parts[] = {"trace", "shade", "query", "record", "update"};
-    static const char *const colours[] = {"#4477aa", "#66ccee", "#228833", "#ccbb44", "#ee6677"};
+    static const char *const parts[] = {"trace", "shade", "query", "record", "update", "denoise"};
+    static const char *const colours[] = {"#4477aa", "#66ccee", "#228833", "#ccbb44", "#ee6677", "#aa3377"};
     static column columns[MAX_NAMES * MAX_NAMES];
     char path[1024];
     int n = columns_of(p, columns), line = 0, height = 60 + 20 * n * p->scenes.count;
@@ -358,7 +473,7 @@ static bool plot_cost(const plan *p, const rows *all)
             "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"900\" height=\"%d\" font-family=\"sans-serif\" "
             "font-size=\"12\"><rect width=\"100%%\" height=\"100%%\" fill=\"white\"/>\n",
             height);
-    for (int k = 0; k < 5; ++k)
+    for (int k = 0; k < 6; ++k)
         fprintf(f,
                 "<rect x=\"%d\" y=\"12\" width=\"12\" height=\"12\" fill=\"%s\"/><text x=\"%d\" y=\"22\">%s</text>\n",
                 250 + 90 * k, colours[k], 267 + 90 * k, parts[k]);
@@ -374,10 +489,12 @@ static bool plot_cost(const plan *p, const rows *all)
             fprintf(f, "<text x=\"240\" y=\"%d\" text-anchor=\"end\">%s, %s</text>\n", y + 12, p->scenes.at[s], text);
             if (!r)
                 continue;
-            double part[] = {r->trace_seconds, r->shade_seconds, r->query_seconds, r->record_seconds,
-                             r->update_seconds};
+            double denoise = isfinite(r->denoise_seconds) ? r->denoise_seconds : 0; /* a part of update */
+            double part[] = {
+                r->trace_seconds, r->shade_seconds, r->query_seconds, r->record_seconds, r->update_seconds - denoise,
+                denoise};
             double x = 250;
-            for (int k = 0; k < 5; ++k) {
+            for (int k = 0; k < 6; ++k) {
                 double w = isfinite(part[k]) ? 600 * fmax(part[k], 0) / r->cpu_seconds : 0;
                 fprintf(f, "<rect x=\"%.1f\" y=\"%d\" width=\"%.1f\" height=\"15\" fill=\"%s\"/>\n", x, y, w,
                         colours[k]);

@@ -23,11 +23,14 @@
     X(relmse_untrimmed)                                                                                                \
     X(mrae_untrimmed)                                                                                                  \
     X(cells)                                                                                                           \
-    X(bytes)
+    X(bytes)                                                                                                           \
+    X(train_spp)                                                                                                       \
+    X(train_seconds)                                                                                                   \
+    X(denoise_seconds)
 
 typedef struct row {
     char scene[64], build[32], method[128];
-    char budget[24]; /* "60s" or "64spp" */
+    char budget[24]; /* "60s" or "64spp", after a training "8+64spp" */
     int seed;
     char status[24]; /* ok, exit N, signal N, timeout */
 #define ROW_FIELD(name) double name;

@@ -87,4 +87,18 @@ done
 [ $status -ne 9 ] && grep -q '"relmse": ' "$tmp/out-same/rows.json" && grep -q '^| cornell | 2s | pt (b) |' "$tmp/out-same/table.md"
 report $? 'plots, JSON and a table are written'
 
+# A training is a budget's first number, and the axis of the plots; what does not learn goes without.
+measure trained "$render" --train 2,4 --spp 4 --seeds 2 --methods pt,sdtree:denoise=off,sdtree
+table=$tmp/out-trained/table.md
+cp "$table" "$tmp/log"
+[ $status -eq 0 ] && [ "$(grep -c ',ok,' "$tmp/out-trained/rows.csv")" -eq 24 ] && [ -s "$tmp/out-trained/error-train-cornell.svg" ] &&
+    grep -qE '^\| cornell \| 2\+4spp \| pt \(a\) \| 4 \|' "$table" &&
+    grep -qE '^\| cornell \| 4\+4spp \| sdtree:denoise=off \(a\) \| 4 \| [0-9.]+ \| [0-9.]+ \| 0\.00 % \|' "$table" &&
+    grep -qE '^\| cornell \| 4\+4spp \| sdtree \(a\) \| 4 \| [0-9.]+ \| [0-9.]+ \| [0-9.]*[1-9][0-9]* % \|' "$table"
+report $? '--train: rows, plots, and the share of the denoise step'
+# Geometric mean over scenes: that of one scene, value and interval, is that scene's.
+[ "$(grep -c '| 4+4spp |' "$table")" -eq 11 ] &&
+    [ "$(grep '^| cornell | 4+4spp | sdtree (a) ' "$table" | cut -d '|' -f 10)" = "$(grep '^| 4+4spp | sdtree (a) ' "$table" | cut -d '|' -f 5)" ]
+report $? 'the geometric mean over one scene is that of the scene, and so is its interval'
+
 finish

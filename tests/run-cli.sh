@@ -91,6 +91,12 @@ refuses 'bad switch: nee' 'nee' good.xml --nee perhaps $quick
 refuses 'bad switch: roulette' 'rr' good.xml --rr perhaps $quick
 refuses 'spp and seconds together' 'spp|seconds' good.xml --spp 1 --seconds 1 --quiet
 refuses 'two scenes' 'good\.xml.*other\.xml' good.xml other.xml $quick
+refuses 'bad number: zero training' 'train.*0' good.xml --method sdtree --train 0 $quick
+refuses '--train on a method that does not learn' 'train.*pt' good.xml --train 4 $quick
+refuses '--train that takes all of the seconds' 'training.*seconds' good.xml --method sdtree --train 64 --seconds 0.001 --quiet
+refuses 'denoise_when=last without a training' 'denoise_when.*--train' good.xml --method sdtree --set denoise_when=last $quick
+refuses 'denoise_when=last without denoising' 'denoise_when.*denoise=on' good.xml --method sdtree --train 4 --set denoise=off \
+    --set denoise_when=last $quick
 completes '--help' --help
 grep -q -- '--method' out && grep -q -- '--seconds' out
 report $? '--help lists the options'
@@ -170,6 +176,24 @@ for method in pt sdtree; do
     [ -s seed.exr ] && ! cmp -s ${method}1.exr seed.exr
     report $? "$method: another seed, another picture"
 done
+# A trained field: the same picture for any number of threads; denoised after the training, it has learned from the same
+# samples as one that never is, and is another.
+train="good.xml --method sdtree --size 80x45 --train 12 --spp 8 --quiet"
+for threads in 1 2 3; do
+    "$render" $train --threads $threads --set denoise_when=last -o last$threads.exr --json last.json >out 2>log || : >last$threads.exr
+done
+[ -s last1.exr ] && cmp last1.exr last2.exr >>log 2>&1 && cmp last1.exr last3.exr >>log 2>&1
+report $? '--train: identical for 1, 2 and 3 threads'
+"$render" $train --set denoise=off -o never.exr --json never.json >out 2>log
+learned() { grep -o '"zeros": [0-9]*, "rejected": [0-9]*' "$1"; }
+cat last.json never.json >log
+[ -n "$(learned never.json)" ] && [ "$(learned last.json)" = "$(learned never.json)" ] && ! cmp -s last1.exr never.exr
+report $? 'denoise_when=last: the training of denoise=off, another field'
+grep -q '"spp": 8,' last.json && grep -q '"train_spp": 12,' last.json && grep -q '"denoise_seconds": [0-9]' last.json &&
+    awk '/"cpu_seconds"/ && !all { all = $2 + 0 } /"train_seconds"/ { sum += $2 } /"render_seconds"/ { sum += $2 }
+        END { exit !(all > 0 && sum > 0.999 * all && sum < 1.001 * all) }' last.json
+report $? '--train: JSON tells the training and the picture apart, their seconds add up'
+completes '--train with a budget in seconds' good.xml --method sdtree --train 2 --seconds 0.5 --quiet
 completes '--quiet says nothing' good.xml $quick -o quiet.exr
 [ ! -s out ] && [ ! -s log ]
 report $? '--quiet leaves stdout and stderr empty'

@@ -440,7 +440,7 @@ static gsd_result record(stress *s, gsd_stream *stream, const gsd_field *f, uint
 /* One pass over a batch of n samples; without memory trouble nothing may fail. */
 static void learn(stress *s, gsd_field *f, gsd_stream *stream, uint32_t n)
 {
-    gsd_pass pass = {stress_chance(s, 0.5), (gsd_denoise_mode)stress_below(s, 3)};
+    gsd_pass pass = {.pixel_estimate = stress_chance(s, 0.5), .denoise = (gsd_denoise_mode)stress_below(s, 3)};
     STRESS_CHECK(s, record(s, stream, f, n) == GSD_OK, "record");
     STRESS_CHECK(s, gsd_accumulate(f, &stream, 1, NULL, NULL) == GSD_OK, "accumulate");
     gsd_stream_clear(stream);

@@ -6,6 +6,7 @@
 
 #include <float.h>
 #include <math.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -487,6 +488,28 @@ static void test_budget_is_kept(void **state)
     }
 }
 
+static void note_step(void *user, const char *step)
+{
+    char *steps = user;
+    size_t n = strlen(steps);
+    snprintf(steps + n, 64 - n, "%s ", step ? step : "end");
+}
+
+/* Refine tells its steps in order, and the end once. */
+static void test_steps_are_told(void **state)
+{
+    (void)state;
+    gsd_desc d;
+    gsd_field *f;
+    char steps[64] = "";
+    gsd_pass pass = {.on_step = note_step, .on_step_user = steps};
+    memset(&d, 0, sizeof d);
+    learn_box(&d, 1000, NULL, NULL, &f);
+    OK(gsd_refine(f, &pass, NULL, NULL));
+    assert_string_equal(steps, "measure denoise split build end ");
+    gsd_destroy(f);
+}
+
 /* One pass may be denoised in another way than the descriptor says. */
 static void test_pass_says_otherwise(void **state)
 {
@@ -535,6 +558,7 @@ int main(void)
         cmocka_unit_test(test_denoising_pays),
         cmocka_unit_test(test_blur_adds_leaves),
         cmocka_unit_test(test_budget_is_kept),
+        cmocka_unit_test(test_steps_are_told),
         cmocka_unit_test(test_pass_says_otherwise),
         cmocka_unit_test(test_any_threads_give_the_same_field),
     };

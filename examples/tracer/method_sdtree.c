@@ -4,11 +4,13 @@
    (samples of a cell before it splits), rho, smoothing, max_depth, max_levels, min_samples, max_memory_mb,
    spatial_filter=nearest|stochastic, directional_filter=nearest|box, learn_alpha=grid|adam|off (on = grid), alpha,
    gate=on|off, gate_margin, gate_gain, gate_probe, guide_weight=on|off, history=on|off, denoise=on|off, denoise_budget,
+   denoise_when=training|last (in every refine, or only in that which ends --train),
    uniform, alias=on|off, simd=scalar|avx2|avx512, product=on|off (with the cosine), jitter=on|off (find looks up a
    jittered position), sparse=on|off (closed fields record only some tiles). */
 #include <stdlib.h>
 #include <string.h>
 
+#include "threads.h"
 #include "tracer.h"
 
 #define GSD_IMPLEMENTATION
@@ -19,12 +21,14 @@ typedef struct sdtree {
     gsd_view view;
     gsd_stream **streams;
     int tiles;
-    bool product, jitter, sparse;
+    bool product, jitter, sparse, denoise_last;
     float fraction; /* of the tiles that record in this pass */
     int pass;
     uint64_t stream_peak;
     tr_parallel_fn parallel;
     void *parallel_user;
+    bool denoising; /* refine is at its denoise step, since: */
+    double denoise_start, denoise_seconds;
 } sdtree;
 
 /* ---- options */
@@ -107,6 +111,11 @@ static bool parse(parser *p, gsd_desc *d, sdtree *m)
     d->no_guide_weight = choice(p, "guide_weight", "off|on") == 0;
     d->no_history = choice(p, "history", "off|on") == 0;
     d->denoise = (gsd_denoise_mode)(choice(p, "denoise", "off|on") + GSD_DENOISE_OFF);
+    m->denoise_last = choice(p, "denoise_when", "training|last") == 1;
+    if (m->denoise_last && d->denoise == GSD_DENOISE_OFF)
+        complain(p, "denoise_when", "last", "denoise=on with it");
+    else if (m->denoise_last && p->env->train == 0)
+        complain(p, "denoise_when", "last", "--train, whose last refine it speaks of");
     d->denoise_budget = (float)number(p, "denoise_budget", 0);
     d->alias = choice(p, "alias", "off|on") == 1;
     d->simd = (gsd_simd)(choice(p, "simd", "scalar|avx2|avx512") + 1);
@@ -225,14 +234,25 @@ static void sdtree_flush(void *method)
         gsd_stream_clear(m->streams[i]);
 }
 
+/* CPU seconds, over all threads, of refine's denoise step. */
+static void sdtree_on_step(void *method, const char *step)
+{
+    sdtree *m = method;
+    if (m->denoising)
+        m->denoise_seconds += tr_cpu_seconds() - m->denoise_start;
+    m->denoising = step && !strcmp(step, "denoise");
+    m->denoise_start = m->denoising ? tr_cpu_seconds() : 0;
+}
+
 static bool sdtree_end_pass(void *method, const tr_pass *pass)
 {
     sdtree *m = method;
-    gsd_pass info = {0};
+    gsd_pass info = {.on_step = sdtree_on_step, .on_step_user = method};
     if (pass->last)
         return true;
     sdtree_flush(m);
     info.pixel_estimate = pass->index > 0; /* of the passes before */
+    info.denoise = m->denoise_last && !pass->freezes ? GSD_DENOISE_OFF : GSD_DENOISE_DEFAULT;
     gsd_result result = gsd_refine(m->field, &info, m->parallel, m->parallel_user);
     m->view = gsd_get_view(m->field);
     return !result;
@@ -307,6 +327,7 @@ static void sdtree_stats(void *method, tr_method_stats *stats)
              "\"mean_depth\": %.3f, \"effective_rho\": %.4g, \"split_cells\": %u, \"rebuilt_trees\": %u, "
              "\"waiting_cells\": %u, \"unread_cells\": %u, \"denoised_trees\": %u, \"smooth_trees\": %u, "
              "\"over_budget_trees\": %u, \"denoised_leaves\": %llu, \"mean_blur\": %.3f, "
+             "\"denoise_seconds\": %.6g, "
              "\"open_cells\": %u, \"closed_cells\": %u, "
              "\"unjudged_cells\": %u, \"opened\": %llu, \"closed\": %llu, \"probed\": %llu, \"closed_share\": %.4f, "
              "\"mean_alpha\": %.4f, \"record_fraction\": %.4f",
@@ -315,8 +336,8 @@ static void sdtree_stats(void *method, tr_method_stats *stats)
              (unsigned long long)s.building_nodes, (unsigned long long)s.peak_bytes, s.max_depth, (double)s.mean_depth,
              (double)s.effective_rho, s.split_cells, s.rebuilt_trees, s.waiting_cells, s.unread_cells, s.denoised_trees,
              s.smooth_trees, s.over_budget_trees, (unsigned long long)s.denoised_leaves, (double)s.mean_blur,
-             s.open_cells, s.closed_cells, s.unjudged_cells, (unsigned long long)s.opened, (unsigned long long)s.closed,
-             (unsigned long long)s.probed, (double)s.closed_share, (double)s.mean_alpha,
+             m->denoise_seconds, s.open_cells, s.closed_cells, s.unjudged_cells, (unsigned long long)s.opened,
+             (unsigned long long)s.closed, (unsigned long long)s.probed, (double)s.closed_share, (double)s.mean_alpha,
              (double)gsd_record_fraction(m->field));
 }
 

@@ -1,5 +1,5 @@
 /* passes.c: the pass loop: growing passes, learning after each, images combined by one scalar weight per group of
-   passes.
+   passes. With settings.train the first passes only teach: the picture begins anew, with a field that stays as it is.
 
      >>rounds   a pass is cut into rounds of bounded memory; the method takes its records in after each
      >>combine  groups of passes, their variances and weights
@@ -40,6 +40,10 @@ typedef struct render_state {
     double start_cpu, update_cpu;
     uint64_t round_tile; /* first tile of the round */
     bool guided;         /* the last pass met cells that guide */
+    bool frozen;         /* after the training: one pass that teaches nothing */
+    int done;            /* samples per pixel so far, those of the training too */
+    double cost;         /* CPU seconds of a sample per pixel in the last pass */
+    bool out_of_time;
 } render_state;
 
 static size_t pixel_count(const render_state *r) { return (size_t)r->frame.width * (size_t)r->frame.height; }
@@ -248,6 +252,13 @@ static bool estimate_pixels(render_state *r)
 
 /* ---- >>loop ------------------------------------------------------------------------------------------------- */
 
+static bool fail(char *err, size_t err_size, const char *text)
+{
+    if (err_size && !err[0])
+        snprintf(err, err_size, "%s", text);
+    return false;
+}
+
 static void *zalloc(size_t count, size_t size) { return calloc(count ? count : 1, size); }
 
 static bool allocate(render_state *r)
@@ -295,14 +306,21 @@ static bool allocate_workers(render_state *r)
     return true;
 }
 
-static void release(render_state *r)
+static void drop_groups(render_state *r)
 {
-    for (int i = 0; i < r->worker_count; ++i)
-        tr_worker_destroy(r->workers[i]);
     for (int i = 0; i < r->group_count; ++i) {
         free(r->groups[i].sum);
         free(r->groups[i].sum_squares);
     }
+    memset(r->groups, 0, sizeof r->groups);
+    r->group_count = 0;
+}
+
+static void release(render_state *r)
+{
+    for (int i = 0; i < r->worker_count; ++i)
+        tr_worker_destroy(r->workers[i]);
+    drop_groups(r);
     if (r->frame.method_data)
         r->settings->method->destroy(r->frame.method_data);
     tr_pool_destroy(r->pool);
@@ -364,20 +382,30 @@ static void report(const render_state *r, double done, int spp, int pass)
     r->settings->progress(r->settings->progress_user, done > 1 ? 1 : done, text);
 }
 
-/* Render one pass of up to `spp` samples; fewer where the CPU budget ends. Returns the samples taken. */
-static int run_pass(render_state *r, int pass, int spp, int done_spp, bool *out_of_time)
+/* Share of the budget that is spent. */
+static double share_done(const render_state *r)
+{
+    const tr_settings *s = r->settings;
+    return s->seconds > 0 ? cpu_used(r) / s->seconds : (double)r->done / ((double)s->train + s->spp);
+}
+
+/* Render one pass of up to `spp` samples; fewer where the CPU budget ends, which a training does not look at. Returns
+   the samples taken. */
+static int run_pass(render_state *r, int pass, int spp)
 {
     const tr_settings *s = r->settings;
     int step = samples_per_round(r), taken = 0;
-    while (taken < spp && !*out_of_time) {
+    bool timed = s->seconds > 0 && (s->train == 0 || r->frozen);
+    while (taken < spp && !r->out_of_time) {
         int count = spp - taken < step ? spp - taken : step;
         double before = cpu_used(r);
         r->frame.describe = taken == 0;
-        render_samples(r, (uint64_t)(done_spp + taken), count);
+        render_samples(r, (uint64_t)r->done, count);
         taken += count;
+        r->done += count;
         double now = cpu_used(r), round = now - before;
-        *out_of_time = s->seconds > 0 && now + 0.5 * round >= s->seconds;
-        report(r, s->seconds > 0 ? now / s->seconds : (double)(done_spp + taken) / s->spp, done_spp + taken, pass);
+        r->out_of_time = timed && now + 0.5 * round >= s->seconds;
+        report(r, share_done(r), r->done, pass);
     }
     return taken;
 }
@@ -392,6 +420,7 @@ static bool learn(render_state *r, const tr_pass *pass)
     if (m->end_pass)
         ok = m->end_pass(r->frame.method_data, pass);
     r->update_cpu += tr_cpu_seconds() - start;
+    r->result->train_seconds = cpu_used(r);
     return ok;
 }
 
@@ -403,53 +432,87 @@ static int pass_spp(int done_spp, bool guided)
     return spp < 1 ? 1 : spp < 1 << 24 ? spp : 1 << 24;
 }
 
-/* Samples for pass k. A pass that would leave too little for a full next one takes the rest instead; `last` tells. */
-static int plan_pass(const render_state *r, int pass, int done_spp, double cost_per_sample, bool *last)
+/* Samples for the next pass of a phase that ends at `limit` samples, or with the CPU budget where that is 0. A timed
+   pass, or one of a training, takes the rest where it would leave too little for a full next one: what a training ends
+   with is to meet most cells. `last` tells. */
+static int plan_pass(const render_state *r, int limit, bool *last)
 {
-    const tr_settings *s = r->settings;
-    int spp = pass_spp(done_spp, r->guided);
-    *last = false;
-    if (s->spp > 0) {
-        int left = s->spp - done_spp;
-        *last = spp >= left;
+    int spp = pass_spp(r->done, r->guided);
+    if (limit > 0) {
+        int left = limit - r->done, next = pass_spp(r->done + spp, r->guided);
+        *last = r->frozen || spp >= left || (r->settings->train > 0 && spp + next > left);
         return *last ? left : spp;
     }
-    double left = s->seconds - cpu_used(r);
-    *last = pass > 0 && cost_per_sample * spp >= left;
+    double left = r->settings->seconds - cpu_used(r);
+    *last = r->frozen || (r->cost > 0 && r->cost * spp >= left);
     return *last ? 1 << 24 : spp;
 }
 
-static bool run_passes(render_state *r)
+/* Plan a pass, render it, learn from it. False = out of memory. */
+static bool next_pass(render_state *r, int limit)
+{
+    const tr_method *m = r->settings->method;
+    tr_result *res = r->result;
+    int pass = res->passes++;
+    bool training = r->settings->train > 0 && !r->frozen;
+    tr_pass info = {.index = pass, .budget = share_done(r)};
+    info.spp = plan_pass(r, limit, &info.last);
+    info.freezes = training && info.last;
+    info.last = !training && info.last;
+    double cpu = cpu_used(r);
+    uint64_t guided_before = total_guided(r);
+    r->frame.record = m->begin_pass ? m->begin_pass(r->frame.method_data, &info) : m->record != NULL;
+    r->frame.guiding = m->find && !(m->idle && m->idle(r->frame.method_data));
+    r->frame.estimate = m->wants_pixel_estimate && pass > 0 ? &r->estimate : NULL;
+    info.spp = run_pass(r, pass, info.spp);
+    r->cost = (cpu_used(r) - cpu) / info.spp;
+    r->guided = total_guided(r) > guided_before;
+    bool ok = close_pass(r, r->done - info.spp, info.spp, r->guided);
+    if (ok && !info.last && !r->out_of_time)
+        ok = learn(r, &info);
+    res->pass[pass].spp = info.spp;
+    res->pass[pass].cpu_seconds = cpu_used(r) - cpu;
+    res->pass[pass].variance = r->groups[r->group_count - 1].variance;
+    return ok;
+}
+
+static bool run_phase(render_state *r, int limit)
+{
+    bool ok = true;
+    while (ok && r->result->passes < TR_MAX_PASSES && !r->out_of_time && (limit <= 0 || r->done < limit))
+        ok = next_pass(r, limit);
+    return ok;
+}
+
+/* The training is over: what it has rendered leaves the picture and its layers, and stays only as pixel estimate. */
+static void freeze(render_state *r)
+{
+    tr_frame *f = &r->frame;
+    size_t n = pixel_count(r);
+    r->frozen = true;
+    r->result->train_passes = r->result->passes;
+    drop_groups(r);
+    memset(f->albedo, 0, 3 * n * sizeof *f->albedo);
+    memset(f->normal, 0, 3 * n * sizeof *f->normal);
+    memset(f->alpha, 0, n * sizeof *f->alpha);
+    memset(f->alpha_count, 0, n * sizeof *f->alpha_count);
+}
+
+static bool run_passes(render_state *r, char *err, size_t err_size)
 {
     const tr_settings *s = r->settings;
-    const tr_method *m = s->method;
-    tr_result *res = r->result;
-    bool out_of_time = false, ok = true;
-    double cost = 0;
-    int done = 0;
-    for (int pass = 0; pass < TR_MAX_PASSES && !out_of_time && ok && (s->spp <= 0 || done < s->spp); ++pass) {
-        tr_pass info = {pass, 0, false, s->seconds > 0 ? cpu_used(r) / s->seconds : (double)done / s->spp};
-        info.spp = plan_pass(r, pass, done, cost, &info.last);
-        double cpu = cpu_used(r);
-        uint64_t guided_before = total_guided(r);
-        r->frame.record = m->begin_pass ? m->begin_pass(r->frame.method_data, &info) : m->record != NULL;
-        r->frame.guiding = m->find && !(m->idle && m->idle(r->frame.method_data));
-        r->frame.estimate = m->wants_pixel_estimate && pass > 0 ? &r->estimate : NULL;
-        int taken = run_pass(r, pass, info.spp, done, &out_of_time);
-        done += taken;
-        info.spp = taken;
-        cost = (cpu_used(r) - cpu) / taken;
-        r->guided = total_guided(r) > guided_before;
-        ok = close_pass(r, done - taken, taken, r->guided);
-        if (ok && !info.last && !out_of_time)
-            ok = learn(r, &info);
-        res->pass[pass].spp = taken;
-        res->pass[pass].cpu_seconds = cpu_used(r) - cpu;
-        res->pass[pass].variance = r->groups[r->group_count - 1].variance;
-        res->passes = pass + 1;
+    bool ok = s->train == 0 || run_phase(r, s->train);
+    if (ok && s->train > 0) {
+        freeze(r);
+        if (s->seconds > 0 && cpu_used(r) >= s->seconds) {
+            snprintf(err, err_size, "the training of %d samples per pixel alone took %.3g CPU seconds: nothing is left",
+                     s->train, cpu_used(r));
+            return false;
+        }
     }
-    res->spp = done;
-    return ok;
+    ok = ok && run_phase(r, s->spp > 0 ? s->train + s->spp : 0);
+    r->result->spp = r->done - s->train;
+    return ok || fail(err, err_size, "out of memory while rendering");
 }
 
 static void finish_layers(render_state *r)
@@ -497,7 +560,7 @@ static bool collect(render_state *r)
     double total = 0;
     for (int i = 0; i < r->group_count; ++i)
         total += r->groups[i].weight;
-    for (int i = 0, g = 0, spp = 0; i < res->passes; ++i) {
+    for (int i = res->train_passes, g = 0, spp = 0; i < res->passes; ++i) {
         res->pass[i].weight = r->groups[g].weight / total * res->pass[i].spp / r->groups[g].spp;
         spp += res->pass[i].spp;
         if (spp >= r->groups[g].spp && g + 1 < r->group_count)
@@ -508,13 +571,6 @@ static bool collect(render_state *r)
     return !sum.out_of_memory;
 }
 
-static bool fail(char *err, size_t err_size, const char *text)
-{
-    if (err_size && !err[0])
-        snprintf(err, err_size, "%s", text);
-    return false;
-}
-
 static bool create_method(render_state *r, char *err, size_t err_size)
 {
     const tr_settings *s = r->settings;
@@ -523,6 +579,7 @@ static bool create_method(render_state *r, char *err, size_t err_size)
                          .height = r->frame.height,
                          .tiles = r->frame.tiles_x * r->frame.tiles_y,
                          .nee = r->frame.nee,
+                         .train = s->train,
                          .seed = s->seed,
                          .threads = s->threads > 0 ? s->threads : tr_cpu_count(),
                          .parallel = tr_pool_run,
@@ -565,6 +622,10 @@ bool tr_render(const tr_scene *scene, const tr_settings *settings, tr_result *re
     bool ok = settings->spp > 0 || settings->seconds > 0;
     if (!ok)
         fail(err, err_size, "no budget: give samples per pixel or CPU seconds");
+    if (ok && settings->train > 0 && !settings->method->learns) {
+        snprintf(err, err_size, "nothing to train: method '%s' does not learn", settings->method->name);
+        ok = false;
+    }
     if (ok && !(ok = allocate(&r)))
         fail(err, err_size, "out of memory for the image");
     double wall = tr_wall_seconds();
@@ -572,8 +633,7 @@ bool tr_render(const tr_scene *scene, const tr_settings *settings, tr_result *re
     ok = ok && create_method(&r, err, err_size);
     if (ok && !(ok = allocate_workers(&r)))
         fail(err, err_size, "out of memory for the workers");
-    if (ok && !(ok = run_passes(&r)))
-        fail(err, err_size, "out of memory while rendering");
+    ok = ok && run_passes(&r, err, err_size);
     if (ok) {
         finish_layers(&r);
         result->cpu_seconds = cpu_used(&r);

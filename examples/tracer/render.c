@@ -31,8 +31,9 @@ static const char usage_text[] =
     "usage: render SCENE.xml|SCENE.gltf|SCENE.glb [options]\n"
     "  --method NAME         guiding method (default pt), listed below\n"
     "  --set key=value       option of the method (repeatable)\n"
-    "  --spp N               budget in samples per pixel, or\n"
-    "  --seconds S           budget in CPU seconds over all threads, learning included\n"
+    "  --train N             N samples per pixel only teach, then the field is frozen and the picture begins anew\n"
+    "  --spp N               budget in samples per pixel, those of --train not counted, or\n"
+    "  --seconds S           budget in CPU seconds over all threads, learning and --train included\n"
     "  --size WxH            picture size (default: the scene's)\n"
     "  --max-depth D         path edges, 1 = emitted light only (default: the scene's)\n"
     "  --nee on|off          next event estimation (default on)\n"
@@ -94,6 +95,8 @@ static bool apply(options *o, const char *name, char *value, bool *known)
         o->json = value;
     else if (!strcmp(name, "--reference"))
         o->reference = value;
+    else if (!strcmp(name, "--train"))
+        ok = parse_long(value, 1, 1 << 24, &n), s->train = (int)n;
     else if (!strcmp(name, "--spp"))
         ok = parse_long(value, 1, 1 << 24, &n), s->spp = (int)n;
     else if (!strcmp(name, "--seconds"))
@@ -236,8 +239,12 @@ static bool write_json(const char *path, const options *o, const tr_result *r, c
     json_number(f, "width", r->color.width);
     json_number(f, "height", r->color.height);
     json_number(f, "spp", r->spp);
+    json_number(f, "train_spp", o->settings.train);
     json_number(f, "passes", r->passes);
+    json_number(f, "train_passes", r->train_passes);
     json_number(f, "cpu_seconds", r->cpu_seconds);
+    json_number(f, "train_seconds", r->train_seconds);
+    json_number(f, "render_seconds", r->cpu_seconds - r->train_seconds);
     json_number(f, "wall_seconds", r->wall_seconds);
     json_number(f, "trace_seconds", r->trace_seconds);
     json_number(f, "shade_seconds", r->cpu_seconds - parts);
@@ -310,10 +317,13 @@ static int write_outputs(const options *o, const tr_result *r)
         rc = die("%s: cannot write the statistics: %s", o->json, strerror(errno));
     if (!o->quiet) {
         double parts = r->trace_seconds + r->record_seconds + r->update_seconds + r->query_seconds;
-        printf("%s: %d spp in %.2f CPU s (trace %.0f %%, shade %.0f %%, query %.0f %%, record %.0f %%, update %.0f %%)",
-               o->method, r->spp, r->cpu_seconds, 100 * r->trace_seconds / r->cpu_seconds,
-               100 * (1 - parts / r->cpu_seconds), 100 * r->query_seconds / r->cpu_seconds,
-               100 * r->record_seconds / r->cpu_seconds, 100 * r->update_seconds / r->cpu_seconds);
+        printf("%s: %d spp in %.2f CPU s", o->method, r->spp, r->cpu_seconds);
+        if (o->settings.train)
+            printf(", of which %.2f for %d spp of training", r->train_seconds, o->settings.train);
+        printf(" (trace %.0f %%, shade %.0f %%, query %.0f %%, record %.0f %%, update %.0f %%)",
+               100 * r->trace_seconds / r->cpu_seconds, 100 * (1 - parts / r->cpu_seconds),
+               100 * r->query_seconds / r->cpu_seconds, 100 * r->record_seconds / r->cpu_seconds,
+               100 * r->update_seconds / r->cpu_seconds);
         if (r->method.cells)
             printf(", %.0f cells, %.1f MB", (double)r->method.cells, (double)r->method.bytes / 1e6);
         if (measured)

@@ -440,6 +440,7 @@ typedef struct tr_method_env {
     int width, height;
     int tiles; /* streams that record is called with: 0 .. tiles - 1 */
     bool nee;
+    int train; /* samples per pixel after which the field is frozen; 0 = it learns while it renders */
     uint64_t seed;
     int threads; /* that `parallel` uses: for methods with threads of their own */
     tr_parallel_fn parallel;
@@ -451,6 +452,7 @@ typedef struct tr_method_env {
 typedef struct tr_pass {
     int index, spp;
     bool last;    /* nothing after it will use what it records */
+    bool freezes; /* the training ends with it: what is learned now is what the picture is made with */
     float budget; /* share of the budget spent before this pass, 0 .. 1 */
 } tr_pass;
 
@@ -517,8 +519,9 @@ typedef enum tr_roulette { TR_ROULETTE_GUIDED, TR_ROULETTE_OFF, TR_ROULETTE_THRO
 
 typedef struct tr_settings {
     int width, height; /* 0 = the scene's */
-    int spp;           /* budget in samples per pixel, or 0 */
-    double seconds;    /* budget in CPU seconds over all threads, or 0 */
+    int train;         /* samples per pixel that teach and are not in the picture; the field is frozen after them */
+    int spp;           /* budget in samples per pixel, those of the training not counted, or 0 */
+    double seconds;    /* budget in CPU seconds over all threads, learning and training included, or 0 */
     int max_depth;     /* 0 = the scene's */
     bool no_nee;
     bool no_bsdf_hits; /* emission counts only through NEE (for tests: NEE-only) */
@@ -536,8 +539,9 @@ typedef struct tr_settings {
 #define TR_MAX_PASSES 256
 typedef struct tr_result {
     tr_image color, variance, albedo, normal, alpha, cell, depth; /* variance: of the pixel mean */
-    int spp, passes;
+    int spp, passes, train_passes; /* train_passes: the first ones, which are not in the picture */
     double cpu_seconds, wall_seconds;
+    double train_seconds; /* CPU seconds until the method had learned for the last time; what follows renders only */
     double trace_seconds, record_seconds, update_seconds, query_seconds; /* CPU seconds, of which shading is the rest */
     uint64_t rays, shadow_rays, paths;
     uint64_t split_paths; /* that guided roulette added */
