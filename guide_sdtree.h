@@ -1955,8 +1955,10 @@ GSDI_GAUSS_AVX512_INLINE void gsdi_gauss_columns_avx512(const float *p, size_t s
     v[3] = gsdi_gauss_taps_avx512(w, r3, r4, r5, r6, r7, r8, r9);
 }
 
+/* The forms with a mask that is always set are the same instructions; g++ 12 warns of the others in C++. */
 #define GSDI_GAUSS_SHIFT_AVX512(high, low, n)                                                                          \
-    _mm512_castsi512_ps(_mm512_alignr_epi32(_mm512_castps_si512(high), _mm512_castps_si512(low), (n)))
+    _mm512_castsi512_ps(_mm512_maskz_alignr_epi32(0xffff, _mm512_castps_si512(high), _mm512_castps_si512(low), (n)))
+#define GSDI_GAUSS_BLOCKS_AVX512(a, b, n) _mm512_maskz_shuffle_f32x4(0xffff, (a), (b), (n))
 
 /* Sixteen columns from the vectors `low`, which starts at column -16, `v` and `high`; past the caches. */
 GSDI_GAUSS_AVX512_INLINE void gsdi_gauss_row_avx512(const __m512 *w, __m512 low, __m512 v, __m512 high, float *out)
@@ -2031,15 +2033,15 @@ GSDI_GAUSS_AVX512 static inline void gsdi_gauss_packed_avx512(const float *in, s
             r1 = gsdi_gauss_shifted_avx512(weight, v[1], next[1]);
             r2 = gsdi_gauss_shifted_avx512(weight, v[2], next[2]);
             r3 = gsdi_gauss_shifted_avx512(weight, v[3], next[3]);
-            low01 = _mm512_shuffle_f32x4(r0, r1, 0x44);
-            low23 = _mm512_shuffle_f32x4(r2, r3, 0x44);
-            high01 = _mm512_shuffle_f32x4(r0, r1, 0xee);
-            high23 = _mm512_shuffle_f32x4(r2, r3, 0xee);
-            _mm512_store_ps(out, _mm512_shuffle_f32x4(low01, low23, 0x88));
-            _mm512_store_ps(out + GSDI_GAUSS_BLOCK, _mm512_shuffle_f32x4(low01, low23, 0xdd));
-            _mm512_store_ps(out + 2 * GSDI_GAUSS_BLOCK, _mm512_shuffle_f32x4(high01, high23, 0x88));
+            low01 = GSDI_GAUSS_BLOCKS_AVX512(r0, r1, 0x44);
+            low23 = GSDI_GAUSS_BLOCKS_AVX512(r2, r3, 0x44);
+            high01 = GSDI_GAUSS_BLOCKS_AVX512(r0, r1, 0xee);
+            high23 = GSDI_GAUSS_BLOCKS_AVX512(r2, r3, 0xee);
+            _mm512_store_ps(out, GSDI_GAUSS_BLOCKS_AVX512(low01, low23, 0x88));
+            _mm512_store_ps(out + GSDI_GAUSS_BLOCK, GSDI_GAUSS_BLOCKS_AVX512(low01, low23, 0xdd));
+            _mm512_store_ps(out + 2 * GSDI_GAUSS_BLOCK, GSDI_GAUSS_BLOCKS_AVX512(high01, high23, 0x88));
             if (n > 3)
-                _mm512_store_ps(out + 3 * GSDI_GAUSS_BLOCK, _mm512_shuffle_f32x4(high01, high23, 0xdd));
+                _mm512_store_ps(out + 3 * GSDI_GAUSS_BLOCK, GSDI_GAUSS_BLOCKS_AVX512(high01, high23, 0xdd));
             out += (n > 3 ? 4 : 3) * GSDI_GAUSS_BLOCK;
             v[0] = next[0];
             v[1] = next[1];
@@ -2052,11 +2054,11 @@ GSDI_GAUSS_AVX512 static inline void gsdi_gauss_packed_avx512(const float *in, s
         r1 = gsdi_gauss_shifted_avx512(weight, v[1], v[1]);
         r2 = gsdi_gauss_shifted_avx512(weight, v[2], v[2]);
         r3 = gsdi_gauss_shifted_avx512(weight, v[3], v[3]);
-        low01 = _mm512_shuffle_f32x4(r0, r1, 0x44);
-        low23 = _mm512_shuffle_f32x4(r2, r3, 0x44);
-        _mm512_store_ps(out, _mm512_shuffle_f32x4(low01, low23, 0x88));
+        low01 = GSDI_GAUSS_BLOCKS_AVX512(r0, r1, 0x44);
+        low23 = GSDI_GAUSS_BLOCKS_AVX512(r2, r3, 0x44);
+        _mm512_store_ps(out, GSDI_GAUSS_BLOCKS_AVX512(low01, low23, 0x88));
         if (n > 1)
-            _mm512_store_ps(out + GSDI_GAUSS_BLOCK, _mm512_shuffle_f32x4(low01, low23, 0xdd));
+            _mm512_store_ps(out + GSDI_GAUSS_BLOCK, GSDI_GAUSS_BLOCKS_AVX512(low01, low23, 0xdd));
         out += n * GSDI_GAUSS_BLOCK;
     }
 }
