@@ -148,6 +148,11 @@ typedef struct data {
     uint64_t *map;
     gsdi_gauss_run *run;
     size_t runs;
+    gsdi_gauss_slot slot; /* to blur the whole tree in */
+    gsdi_sum *sum;
+    double *mass;
+    unsigned char *height;
+    gsd_simd simd;
 } data;
 
 typedef void (*kernel_fn)(data *d);
@@ -303,6 +308,14 @@ static void run_packed_neon(data *d)
 }
 #endif
 
+/* All of it for one tree: layers 6 .. 11, merged, and the nodes of the new tree counted. */
+static void run_tree(data *d)
+{
+    gsdi_gauss_blur(&d->slot, d->building, d->mass, d->height, d->simd, false, d->w);
+    if (gsdi_gauss_rebuild(&d->slot, 0.01, d->building, d->sum, NULL, NULL, NULL) < 5)
+        fail("the blurred tree is empty");
+}
+
 typedef enum check { CHECK_NONE, CHECK_THESIS, CHECK_OWN, CHECK_PACKED } check;
 
 typedef struct kernel {
@@ -438,6 +451,25 @@ static data make_data(double sigma)
     return d;
 }
 
+static void make_slot(data *d)
+{
+    uint32_t count = 4 * d->tree.count + 1;
+    unsigned char *depth = allocate(count, 1);
+    uint64_t bytes[5];
+    d->sum = allocate(count, sizeof *d->sum);
+    d->mass = allocate(count, sizeof *d->mass);
+    d->height = allocate(count, 1);
+    for (uint32_t k = 0; k + 1 < count; ++k)
+        d->sum[k + 1].half[0] = d->tree.child[k] ? 0 : d->tree.value[k];
+    gsdi_tree_masses(d->building, d->sum, count, false, d->mass, depth);
+    gsdi_gauss_heights(d->building, count, d->height);
+    d->slot.depth = DEPTH;
+    d->slot.memory = allocate(1, (size_t)gsdi_gauss_parts(DEPTH, bytes));
+    gsdi_gauss_slot_cut(&d->slot, DEPTH);
+    d->simd = gsdi_simd(GSD_SIMD_AUTO);
+    free(depth);
+}
+
 static void list_kernels(bool quick)
 {
     int slow = quick ? 1 : 4, medium = quick ? 2 : 16, fast = quick ? 4 : REPEATS;
@@ -479,6 +511,7 @@ static void list_kernels(bool quick)
 #endif
     add("fill the margins", run_pad, CHECK_NONE, fast, 0, 0);
     add("list the runs of blocks", run_runs, CHECK_NONE, fast, 0, 0);
+    add("a whole tree, best level", run_tree, CHECK_NONE, medium, 0, 0);
     (void)avx2;
     (void)avx512;
 }
@@ -529,6 +562,7 @@ int main(int argc, char **argv)
         fail("--sigma wants 0.3 .. 100");
     bench_print_machine(json);
     data d = make_data(sigma);
+    make_slot(&d);
     dn_matrix m = dn_flatten(&d.tree, DEPTH);
     dn_matrix zero = dn_blur(&m, sigma, DN_ZERO, NULL), sphere = dn_blur(&m, sigma, DN_SPHERE, NULL);
     list_kernels(quick);
@@ -552,6 +586,10 @@ int main(int argc, char **argv)
     }
     dn_free_tree(&d.tree);
     free(d.building);
+    free(d.slot.memory);
+    free(d.sum);
+    free(d.mass);
+    free(d.height);
     free(d.plain);
     free(d.thesis);
     free(d.own - gsdi_gauss_origin(WIDTH));

@@ -195,6 +195,7 @@ static void test_documented_defaults_are_the_defaults(void **state)
                   {"split_samples", (double)d.split_samples},
                   {"rho", (double)d.rho},
                   {"smoothing", (double)d.smoothing},
+                  {"gaussian_sigma", (double)d.gaussian_sigma},
                   {"max_depth", d.max_depth},
                   {"max_levels", d.max_levels},
                   {"min_samples", d.min_samples},
