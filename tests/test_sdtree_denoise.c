@@ -1033,6 +1033,44 @@ static void test_gaussian_stays_under_max_bytes(void **state)
     assert_true(over > 0 && denoised > 100);
 }
 
+/* Fields that fill the cap: trees whose results would not leave room for the new part are left alone, so that a refine
+   that fits without denoising fits with it too. */
+static void test_gaussian_gives_back_what_does_not_fit(void **state)
+{
+    (void)state;
+    uint32_t back = 0, fitted = 0;
+    for (uint32_t cells = 100; cells <= 180; cells += 4) {
+        gsd_desc d = {.max_bytes = 1 << 20, .gaussian_rho = 0.004f, .gaussian_sigma = 3, .gaussian_no_limit = true};
+        gsd_field *f = gaussian_forest(d, cells), *off;
+        gsd_pass pass = {.denoise = GSD_DENOISE_OFF};
+        gsd_stats stats, plain;
+        tree *t = make_tree(7, 6, -1);
+        for (uint32_t c = 0; c < cells; ++c)
+            plant(f, c, t, 1000);
+        free(t);
+        size_t size = gsd_save_bound(f);
+        void *data = malloc(size);
+        OK(gsd_save(f, data, size, &size));
+        OK(gsd_load(NULL, data, size, &off));
+        OK(gsd_refine(off, &pass, NULL, NULL));
+        OK(gsd_refine(f, NULL, NULL, NULL));
+        OK(gsd_validate(f));
+        gsd_get_stats(f, &stats);
+        gsd_get_stats(off, &plain);
+        assert_int_equal(stats.denoised_trees + stats.over_budget_trees, cells);
+        if (plain.peak_bytes <= d.max_bytes) {
+            fitted++;
+            back += stats.denoised_trees > 0 && stats.over_budget_trees > 0;
+            assert_true(stats.peak_bytes <= d.max_bytes);
+        }
+        free(data);
+        gsd_destroy(f);
+        gsd_destroy(off);
+    }
+    print_message("%u fields fit, %u of them denoised in part\n", fitted, back);
+    assert_true(fitted > 10 && back > 3);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -1051,6 +1089,7 @@ int main(void)
         cmocka_unit_test(test_gaussian_survives_hostile_trees),
         cmocka_unit_test(test_gaussian_survives_failed_allocations),
         cmocka_unit_test(test_gaussian_stays_under_max_bytes),
+        cmocka_unit_test(test_gaussian_gives_back_what_does_not_fit),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
