@@ -326,10 +326,11 @@ typedef struct gsd_stats {
     uint64_t leaves;   /* of which leaves */
     uint64_t building_nodes;
     uint64_t bytes;             /* sampling and building part now */
-    uint64_t peak_bytes;        /* most held at once by both, old and new; <= max_bytes */
+    uint64_t peak_bytes;        /* most held at once by both, old and new; <= max_bytes; GSD_DENOISE_GAUSSIAN
+                                   counts as if it ran in parallel */
     uint64_t opened, closed;    /* verdicts of the gate so far */
     uint64_t probed;            /* closed cells tried again so far */
-    uint64_t denoised_leaves;   /* of all quadtrees that refine tried to blur so far */
+    uint64_t denoised_leaves;   /* of all quadtrees that refine tried to blur so far, Gaussian aside */
     uint32_t passes;            /* calls of refine */
     uint32_t cells;             /* now */
     uint32_t trees;             /* distinct quadtrees in the sampling part now (cells share after a split) */
