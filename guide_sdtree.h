@@ -38,8 +38,8 @@
      >>types     descriptor, sample, results   >>batch   find, sample, pdf of arrays
      >>field     create, refine, stats         >>store   save, load, merge, export, import
      implementation:
-     >>memory  >>math  >>streams  >>trees  >>denoise  >>accumulate  >>gate  >>block  >>refine  >>life  >>forest
-     >>batches  >>files  >>check  >>plain  >>licence
+     >>memory  >>math  >>streams  >>trees  >>denoise  >>gaussian  >>accumulate  >>gate  >>block  >>refine  >>life
+     >>forest  >>batches  >>files  >>check  >>plain  >>licence
 
    HOW IT WORKS
      Space is a binary tree over a cube: axes in turn, cut in the middle. A leaf (*cell*) splits when it holds more than
@@ -79,6 +79,14 @@
      (largest sum of mass_other log density), converted to that of both together, t / (2 - t). Trees whose halves agree
      best without a blur stay as they are. On by default; the idea is that of Nilsson's thesis [Nilsson], whose fixed
      Gaussians and matrices this does without.
+     GSD_DENOISE_GAUSSIAN is the method of the thesis (its chapter 4), to compare with. Layers 6, 7, ... of a tree, down
+     to its deepest leaf, become matrices 2^layer wide: leaves above a layer are split by area, the subtree below an
+     element counts with its sum times 4^-(its depth). Each is blurred by a 7 x 7 Gaussian of desc.gaussian_sigma
+     elements, zeros outside (desc.gaussian_sphere: phi wraps, poles are crossed), where the window reaches beyond one
+     leaf. All are expanded to the width of the last and merged by their maximum; the tree is rebuilt from that with
+     desc.gaussian_rho, scaled to its old mass, and keeps its sums, by area. Trees above layer 6 stay as they are. Work
+     is limited to 1.5e7 2^k elements in the k-th refine (from 0) and to trees not deeper than 10, unless
+     desc.gaussian_no_limit. Trees that find no room under max_bytes stay as they are.
 
      Selection probability: handle.alpha is the probability to sample the BSDF; 1 means: do not guide here. The caller
      draws from the BSDF with alpha, else from gsd_sample, and divides by alpha pdf_bsdf + (1 - alpha) gsd_pdf.
@@ -110,9 +118,11 @@
      Building part: 20 bytes per quadtree node, sizeof(gsd_cell_state) (below 600) per cell.
      max_bytes bounds the peak of both parts while refine runs, old and new together: trees coarsen and cells stop
      splitting; it never fails. (Only what comes from outside can lie above it, and stays: the cells of a forest,
-     imported trees.) Streams (44 bytes per sample) and the scratch of accumulate (at most 13 MB and 8 bytes per cell,
-     kept for the next call) come on top. Allocation happens in create, stream_create, record, accumulate, refine,
-     import, load, gsd_forest_split; never in a query. Stack: below 16 KB per call.
+     imported trees.) Of it GSD_DENOISE_GAUSSIAN takes up to a quarter, 10 MB for a tree of depth 10, four times that
+   for each level more and for up to 32 trees at once, and up to an eighth for the trees it makes, 28 bytes per node,
+   which stay until the new part stands. Streams (44 bytes per sample) and the scratch of accumulate (at most 13 MB and
+   8 bytes per cell, kept for the next call) come on top. Allocation happens in create, stream_create, record,
+   accumulate, refine, import, load, gsd_forest_split; never in a query. Stack: below 16 KB per call.
 
    THREADS: each function has a tag.
      [any thread]   pure function on constant data
@@ -135,7 +145,8 @@
      after rounding (depth 20: 2 %, depth 12: 0.006 %): gsd_sample returns the density of the rounded direction, the
      same as gsd_pdf for it. phi is computed to 4e-8 rad. SIMD levels differ from scalar by <= 2e-6 relative, and by the
      neighbour's density for about 1e-6 of directions within rounding of a leaf's edge. accumulate and refine use one
-     code path for all levels.
+     code path for all levels, but for the matrices of GSD_DENOISE_GAUSSIAN: they differ by <= 1e-6 relative, so that a
+     node within that of the threshold is divided at one level and not at another.
 
    REFERENCES
      T. Mueller, M. Gross, J. Novak 2017, Practical Path Guiding for Efficient Light-Transport Simulation.
@@ -224,10 +235,17 @@ typedef enum gsd_alpha_mode {
 typedef enum gsd_denoise_mode {
     GSD_DENOISE_DEFAULT, /* = GSD_DENOISE_BLUR; in gsd_pass: what the descriptor says */
     GSD_DENOISE_OFF,     /* quadtrees as they were gathered */
-    GSD_DENOISE_BLUR     /* see HOW IT WORKS */
+    GSD_DENOISE_BLUR,    /* see HOW IT WORKS */
+    GSD_DENOISE_GAUSSIAN /* fixed Gaussians over matrices, as published [Nilsson]: a reference to compare with */
 } gsd_denoise_mode;
 
-typedef enum gsd_simd { GSD_SIMD_AUTO, GSD_SIMD_SCALAR, GSD_SIMD_AVX2, GSD_SIMD_AVX512 } gsd_simd;
+typedef enum gsd_simd {
+    GSD_SIMD_AUTO,
+    GSD_SIMD_SCALAR,
+    GSD_SIMD_AVX2,
+    GSD_SIMD_AVX512,
+    GSD_SIMD_NEON /* the Gaussian denoiser only; queries as GSD_SIMD_SCALAR */
+} gsd_simd;
 
 /* Zero-initialise it; zero means the default. Fields named no_x switch a default behaviour off. */
 typedef struct gsd_desc {
@@ -249,15 +267,20 @@ typedef struct gsd_desc {
     bool no_guide_weight; /* second-moment targets: w = 1 */
     bool no_history;      /* clear the sums in every refine; see HOW IT WORKS */
     gsd_denoise_mode denoise;
-    float denoise_budget;  /* leaves that refine may blur, for each sample so far and beyond 131,072; 0.001 .. 1e6;
-                              default 0.25: on usual machines 20 ns a sample */
-    float smoothing;       /* K, samples' worth of evenness, see HOW IT WORKS, 0.001 .. 1000; default 3 */
+    float denoise_budget;   /* leaves that refine may blur, for each sample so far and beyond 131,072; 0.001 .. 1e6;
+                               default 0.25: on usual machines 20 ns a sample */
+    float gaussian_sigma;   /* of GSD_DENOISE_GAUSSIAN, in elements of a layer's matrix, 0.1 .. 100; default 0.8 */
+    float gaussian_rho;     /* as rho, of the trees it makes, 1e-5 .. 1; default 0: rho */
+    bool gaussian_sphere;   /* phi wraps and poles are crossed; the thesis has zeros outside the matrix */
+    bool gaussian_no_limit; /* no limit of work, trees down to depth 12 */
+    float smoothing;        /* K, samples' worth of evenness, see HOW IT WORKS, 0.001 .. 1000; default 3 */
     bool alias;            /* build alias tables: sampling in constant time, but not monotone in u; + 12 bytes a leaf */
     float gate_margin;     /* V(1) / V(a) - 1 below which guiding does not pay, 0.001 .. 10; default 0.05 */
     float gate_gain;       /* V(1) - V(a) below which guiding does not pay, 0.0001 .. 1000; default 0.25 */
     uint32_t gate_probe;   /* passes between tries of a closed cell, 1 .. 1000; default 1 */
     uint32_t forest_cells; /* > 0: no spatial tree; that many cells, which the caller addresses by index */
-    gsd_simd simd;         /* pin the level of the batch queries; default: the best that this machine has */
+    gsd_simd simd;         /* pin the level of the batch queries and of GSD_DENOISE_GAUSSIAN; default: the best that
+                              this machine has */
     void *(*allocate)(void *user, size_t size); /* default malloc; NULL on failure; 16-byte aligned */
     void (*release)(void *user, void *pointer); /* default free; pointer may be NULL */
     void *user;
@@ -307,10 +330,11 @@ typedef struct gsd_stats {
     uint64_t leaves;   /* of which leaves */
     uint64_t building_nodes;
     uint64_t bytes;             /* sampling and building part now */
-    uint64_t peak_bytes;        /* most held at once by both, old and new; <= max_bytes */
+    uint64_t peak_bytes;        /* most held at once by both, old and new; <= max_bytes; GSD_DENOISE_GAUSSIAN
+                                   counts as if it ran in parallel */
     uint64_t opened, closed;    /* verdicts of the gate so far */
     uint64_t probed;            /* closed cells tried again so far */
-    uint64_t denoised_leaves;   /* of all quadtrees that refine tried to blur so far */
+    uint64_t denoised_leaves;   /* of all quadtrees that refine tried to blur so far, Gaussian aside */
     uint32_t passes;            /* calls of refine */
     uint32_t cells;             /* now */
     uint32_t trees;             /* distinct quadtrees in the sampling part now (cells share after a split) */
@@ -321,7 +345,10 @@ typedef struct gsd_stats {
     uint32_t unread_cells;      /* last refine: no new samples: no work done */
     uint32_t denoised_trees;    /* last refine: rebuilt and blurred */
     uint32_t smooth_trees;      /* last refine: rebuilt, better without a blur by what their samples say */
-    uint32_t over_budget_trees; /* last refine: rebuilt and left as they are, see desc.denoise_budget */
+    uint32_t over_budget_trees; /* last refine: rebuilt and left as they are, see desc.denoise_budget; Gaussian: over
+                                   the limit of work, or no memory for them under max_bytes */
+    uint32_t shallow_trees;     /* last refine, Gaussian: rebuilt and left as they are, nothing at layer 6 */
+    uint32_t deep_trees;        /* last refine, Gaussian: deeper than 10 (without limit 12) */
     uint32_t open_cells;        /* gate: guiding shown to pay */
     uint32_t closed_cells;      /* gate: shown not to pay; alpha = 1 */
     uint32_t unjudged_cells;    /* gate: guiding (once there is a tree), no verdict yet */
@@ -329,7 +356,8 @@ typedef struct gsd_stats {
     float mean_depth;           /* mean over trees of leaf depth weighted by mass; 0 = nothing learned */
     float closed_share;         /* share of the last pass's samples in closed cells, 0 .. 1 */
     float mean_alpha;           /* over the last pass's samples, closed cells as 1 */
-    float mean_blur; /* of the trees that the last refine rebuilt: how far shares moved towards those around */
+    float mean_blur; /* of the trees that the last refine rebuilt: how far shares moved towards those around; 0 where
+                        the blur was Gaussian */
     float reserved;
 } gsd_stats;
 
@@ -917,6 +945,12 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #include <immintrin.h>
 #else
 #define GSDI_X86 0
+#endif
+#if !defined(GSD_NO_SIMD) && (defined(__GNUC__) || defined(__clang__)) && defined(__aarch64__)
+#define GSDI_NEON 1
+#include <arm_neon.h>
+#else
+#define GSDI_NEON 0
 #endif
 #if defined(__GNUC__) || defined(__clang__)
 #define GSDI_PREFETCH(p) __builtin_prefetch(p)
@@ -1564,6 +1598,827 @@ static double gsdi_blur_tree(const uint32_t *child, const gsdi_sum *sum, const u
         m[i] = c ? (m[c] + m[c + 1]) + (m[c + 2] + m[c + 3]) : m[i] + low * (near - m[i]);
     }
     return low;
+}
+
+/* ---- >>gaussian --------------------------------------------------------------------------------------------- */
+
+/* The method of [Nilsson, ch. 4]; see HOW IT WORKS. 7 x 7 Gaussian blur of a layer of a quadtree, separable, over the
+   whole matrix or only where it changes something:
+
+     out[r][c] = sum over i, j = -3 .. 3 of w[|i|] w[|j|] in[r + i][c + j],  w[0] + 2 (w[1] + w[2] + w[3]) = 1
+
+   >= 0 in, >= 0 out; a NaN or infinity spreads over its window and no further. Relative error 3e-7 (bench_denoise; all
+   terms are positive), as long as no product of two weights and a mass underflows.
+
+   THE MATRIX in: element (0, 0) 64-byte aligned, `stride` floats from row to row, a multiple of 16. Rows -3 ..
+   width + 2 and columns -16 .. width + 15 exist, and 16 floats more (see gsdi_gauss_floats); gsdi_gauss_pad fills what
+   is outside 0 .. width - 1, so that the kernels know no borders. width: a power of two, >= 32. The margins also keep
+   the ten rows that are read at once out of each other's cache sets (width floats alone would put all of them into the
+   same ones).
+   THE RESULT out: 64-byte aligned rows, no margin needed, not in place.
+
+   Four rows at once: ten rows are loaded for four vertical sums, which stay in registers; the horizontal sum takes its
+   seven shifts from two neighbouring vectors of them. Nothing is stored in between. Taps of equal weight are added
+   first: 3 additions and 4 multiplications (fused) instead of 7, and on many machines those have different ports.
+   Deviation from the thesis's 4.3: separable instead of 49 products a pixel, vectors of neighbouring pixels instead of
+   the window's rows, no tiles (four rows at a time stream), masked by blocks instead of pixels. */
+#define GSDI_GAUSS_MARGIN 16u  /* columns on either side */
+#define GSDI_GAUSS_ROWS 4u     /* of a block */
+#define GSDI_GAUSS_COLUMNS 4u  /* of a block: beside a border three columns of either leaf change */
+#define GSDI_GAUSS_BLOCK 16u   /* floats: one cache line */
+#define GSDI_GAUSS_AHEAD 8u    /* runs that input is fetched ahead: the processor cannot guess where the next one is */
+#define GSDI_GAUSS_FIRST 6u    /* layer: "a minimum depth of 6 was found to work well" */
+#define GSDI_GAUSS_DEEPEST 10u /* tree that is denoised with the work limit on */
+#define GSDI_GAUSS_MOST 12u    /* ... and without: 160 MB at once for one tree */
+#define GSDI_GAUSS_WORK 1.5e7  /* elements that pass 0 may blur */
+#define GSDI_GAUSS_SLOTS 32u   /* trees at once */
+
+/* Floats from row to row, in all, and before element (0, 0). */
+static inline size_t gsdi_gauss_stride(uint32_t width) { return (size_t)width + 2 * GSDI_GAUSS_MARGIN; }
+static inline size_t gsdi_gauss_floats(uint32_t width) { return ((size_t)width + 6) * gsdi_gauss_stride(width) + 16; }
+static inline size_t gsdi_gauss_origin(uint32_t width) { return 3 * gsdi_gauss_stride(width) + GSDI_GAUSS_MARGIN; }
+
+/* w[0..3] for sigma > 0, in elements. */
+static inline void gsdi_gauss_weights(double sigma, float w[4])
+{
+    double g[4], sum = 0;
+    int i;
+    for (i = 0; i < 4; ++i) {
+        g[i] = exp(-i * i / (2 * sigma * sigma));
+        sum += i ? 2 * g[i] : g[i];
+    }
+    for (i = 0; i < 4; ++i)
+        w[i] = (float)(g[i] / sum);
+}
+
+/* Fill the margins: sphere = phi wraps and row -1-k is row k shifted by half the width, likewise at the other pole;
+   otherwise zeros. */
+static inline void gsdi_gauss_pad(float *in, size_t stride, uint32_t width, bool sphere)
+{
+    size_t w = width, half = w / 2, margin = GSDI_GAUSS_MARGIN, bytes = (w + 2 * margin) * sizeof(float), r;
+    for (r = 0; r < w; ++r) {
+        float *row = in + r * stride;
+        if (sphere) {
+            memcpy(row - margin, row + w - margin, margin * sizeof(float));
+            memcpy(row + w, row, margin * sizeof(float));
+        } else {
+            memset(row - margin, 0, margin * sizeof(float));
+            memset(row + w, 0, margin * sizeof(float));
+        }
+    }
+    memset(in + (w + 3) * stride - margin, 0, margin * sizeof(float)); /* vectors reach so far; nobody uses it */
+    for (r = 0; r < 3; ++r) {
+        float *below = in - (r + 1) * stride, *above = in + (w + r) * stride;
+        const float *first = in + r * stride, *last = in + (w - 1 - r) * stride;
+        if (sphere) { /* the padded row, turned: columns half - 16 .. half + 15 exist on either side of half */
+            memcpy(below - margin, first + half - margin, (half + margin) * sizeof(float));
+            memcpy(below + half, first, (half + margin) * sizeof(float));
+            memcpy(above - margin, last + half - margin, (half + margin) * sizeof(float));
+            memcpy(above + half, last, (half + margin) * sizeof(float));
+        } else {
+            memset(below - margin, 0, bytes);
+            memset(above - margin, 0, bytes);
+        }
+    }
+}
+
+/* Blocks first .. end - 1 of block row `row`. */
+typedef struct gsdi_gauss_run {
+    uint32_t row;
+    uint16_t first, end;
+} gsdi_gauss_run;
+
+/* Words of 64 blocks in a block row; words of a whole map. */
+static inline uint32_t gsdi_gauss_map_stride(uint32_t width) { return (width / GSDI_GAUSS_COLUMNS + 63) / 64; }
+static inline size_t gsdi_gauss_map_words(uint32_t width)
+{
+    return (size_t)(width / GSDI_GAUSS_ROWS) * gsdi_gauss_map_stride(width);
+}
+
+/* Set bits first .. end - 1 of a row of the map. */
+static inline void gsdi_gauss_mark(uint64_t *row, uint32_t first, uint32_t end)
+{
+    uint32_t word = first / 64, last = (end - 1) / 64;
+    uint64_t low = ~(uint64_t)0 << (first % 64), high = ~(uint64_t)0 >> (63 - (end - 1) % 64);
+    if (word == last) {
+        row[word] |= low & high;
+        return;
+    }
+    row[word] |= low;
+    while (++word < last)
+        row[word] = ~(uint64_t)0;
+    row[last] |= high;
+}
+
+/* Map of the blocks in which the window of any element reaches beyond its leaf; layer >= 5. A
+   square of 16 or more that is a leaf is active along its frame; one of 8 is active whether it is divided or not, so
+   that nothing below needs a look. */
+static inline void gsdi_gauss_map(const uint32_t *child, uint32_t layer, uint64_t *map)
+{
+    gsdi_square stack[GSDI_STACK], s;
+    uint32_t width = 1u << layer, stride = gsdi_gauss_map_stride(width), top = 1, k, r;
+    memset(map, 0, gsdi_gauss_map_words(width) * sizeof *map);
+    stack[0].node = stack[0].x = stack[0].y = 0;
+    stack[0].size = width;
+    while (top) {
+        s = stack[--top];
+        for (k = 0; k < 4; ++k) {
+            uint32_t c = child[s.node] + k, size = s.size / 2;
+            uint32_t x = s.x + (k & 1 ? size : 0), y = s.y + (k & 2 ? size : 0);
+            uint32_t first = x / GSDI_GAUSS_COLUMNS, end = (x + size) / GSDI_GAUSS_COLUMNS;
+            uint32_t lowest = y / GSDI_GAUSS_ROWS, highest = (y + size) / GSDI_GAUSS_ROWS - 1;
+            if (child[c] && size > 8) {
+                stack[top].node = c;
+                stack[top].x = x;
+                stack[top].y = y;
+                stack[top++].size = size;
+                continue;
+            }
+            gsdi_gauss_mark(map + (size_t)lowest * stride, first, end);
+            gsdi_gauss_mark(map + (size_t)highest * stride, first, end);
+            for (r = lowest + 1; r < highest; ++r) {
+                map[(size_t)r * stride + first / 64] |= (uint64_t)1 << (first % 64);
+                map[(size_t)r * stride + (end - 1) / 64] |= (uint64_t)1 << ((end - 1) % 64);
+            }
+        }
+    }
+}
+
+/* Runs of the block rows `from` .. `to` - 1; at most (to - from) * width / 8. Returns their number. */
+static inline size_t gsdi_gauss_runs(const uint64_t *map, uint32_t width, uint32_t from, uint32_t to,
+                                     gsdi_gauss_run *run)
+{
+    uint32_t blocks = width / GSDI_GAUSS_COLUMNS, stride = gsdi_gauss_map_stride(width), r, b;
+    size_t count = 0;
+    for (r = from; r < to; ++r) {
+        const uint64_t *row = map + (size_t)r * stride;
+        for (b = 0; b < blocks;) {
+            uint64_t rest = row[b / 64] >> (b % 64);
+            if (!rest) { /* nothing left in this word */
+                b = (b / 64 + 1) * 64;
+                continue;
+            }
+            while (!(rest & 1)) {
+                rest >>= 1;
+                ++b;
+            }
+            run[count].row = r;
+            run[count].first = (uint16_t)b;
+            while (b < blocks && (row[b / 64] >> (b % 64) & 1))
+                ++b;
+            run[count++].end = (uint16_t)b;
+        }
+    }
+    return count;
+}
+
+/* Four rows, `columns` of them; in and out point to the first element of the first row. */
+static inline void gsdi_gauss_strip(const float *in, size_t stride, float *out, size_t out_stride, uint32_t columns,
+                                    const float *w)
+{
+    float v[4][64 + 6];
+    uint32_t at, i, c, n;
+    for (at = 0; at < columns; at += n) {
+        n = columns - at < 64 ? columns - at : 64;
+        for (i = 0; i < 4; ++i) {
+            const float *p = in + i * stride + at - 3;
+            for (c = 0; c < n + 6; ++c)
+                v[i][c] = w[0] * p[c] + w[1] * (p[c - stride] + p[c + stride]) +
+                          w[2] * (p[c - 2 * stride] + p[c + 2 * stride]) +
+                          w[3] * (p[c - 3 * stride] + p[c + 3 * stride]);
+        }
+        for (i = 0; i < 4; ++i) {
+            const float *h = v[i];
+            float *o = out + i * out_stride + at;
+            for (c = 0; c < n; ++c)
+                o[c] = w[0] * h[c + 3] + w[1] * (h[c + 2] + h[c + 4]) + w[2] * (h[c + 1] + h[c + 5]) +
+                       w[3] * (h[c] + h[c + 6]);
+        }
+    }
+}
+
+/* Rows `from` .. `to` - 1, multiples of 4. */
+static inline void gsdi_gauss_full_scalar(const float *in, size_t stride, float *out, size_t out_stride, uint32_t width,
+                                          uint32_t from, uint32_t to, const float w[4])
+{
+    uint32_t r;
+    for (r = from; r < to; r += GSDI_GAUSS_ROWS)
+        gsdi_gauss_strip(in + r * stride, stride, out + r * out_stride, out_stride, width, w);
+}
+
+/* Only the blocks of these runs, packed: 4 rows of 4, block after block in the order of the runs; out 64-byte aligned,
+   GSDI_GAUSS_BLOCK floats a block. (Written to their places in a matrix instead, most of the time goes into memory:
+   half a line, then somewhere else.) */
+static inline void gsdi_gauss_packed_scalar(const float *in, size_t stride, float *out, const gsdi_gauss_run *run,
+                                            size_t count, const float w[4])
+{
+    size_t i;
+    uint32_t b;
+    for (i = 0; i < count; ++i)
+        for (b = run[i].first; b < run[i].end; ++b, out += GSDI_GAUSS_BLOCK)
+            gsdi_gauss_strip(in + (size_t)run[i].row * GSDI_GAUSS_ROWS * stride + (size_t)b * GSDI_GAUSS_COLUMNS,
+                             stride, out, GSDI_GAUSS_COLUMNS, GSDI_GAUSS_COLUMNS, w);
+}
+
+/* Fetch the four rows of a run that the block row before it has not needed. */
+static inline void gsdi_gauss_prefetch(const float *in, size_t stride, const gsdi_gauss_run *run)
+{
+    const float *p =
+        in + ((size_t)run->row * GSDI_GAUSS_ROWS + 3) * stride + (size_t)run->first * GSDI_GAUSS_COLUMNS - 4;
+    size_t c, end = (size_t)(run->end - run->first) * GSDI_GAUSS_COLUMNS + 8;
+    for (c = 0; c < end; c += 16) {
+        GSDI_PREFETCH(p + c);
+        GSDI_PREFETCH(p + stride + c);
+        GSDI_PREFETCH(p + 2 * stride + c);
+        GSDI_PREFETCH(p + 3 * stride + c);
+    }
+}
+
+#if GSDI_X86
+#define GSDI_GAUSS_AVX2 __attribute__((target("avx2,fma")))
+#define GSDI_GAUSS_AVX2_INLINE __attribute__((target("avx2,fma"), always_inline)) static inline
+#define GSDI_GAUSS_AVX512 __attribute__((target("avx512f,avx512dq,avx512vl,avx2,fma")))
+#define GSDI_GAUSS_AVX512_INLINE                                                                                       \
+    __attribute__((target("avx512f,avx512dq,avx512vl,avx2,fma"), always_inline)) static inline
+
+GSDI_GAUSS_AVX2_INLINE __m256 gsdi_gauss_taps_avx2(const __m256 *w, __m256 a, __m256 b, __m256 c, __m256 d, __m256 e,
+                                                   __m256 f, __m256 g)
+{
+    __m256 near = _mm256_fmadd_ps(w[1], _mm256_add_ps(c, e), _mm256_mul_ps(w[0], d));
+    return _mm256_fmadd_ps(w[3], _mm256_add_ps(a, g), _mm256_fmadd_ps(w[2], _mm256_add_ps(b, f), near));
+}
+
+/* Vertical sums of four rows at eight columns from p on, p in the first row. */
+GSDI_GAUSS_AVX2_INLINE void gsdi_gauss_columns_avx2(const float *p, size_t stride, const __m256 *w, __m256 v[4])
+{
+    __m256 r0 = _mm256_loadu_ps(p - 3 * stride), r1 = _mm256_loadu_ps(p - 2 * stride);
+    __m256 r2 = _mm256_loadu_ps(p - stride), r3 = _mm256_loadu_ps(p), r4 = _mm256_loadu_ps(p + stride);
+    __m256 r5 = _mm256_loadu_ps(p + 2 * stride), r6 = _mm256_loadu_ps(p + 3 * stride);
+    __m256 r7 = _mm256_loadu_ps(p + 4 * stride), r8 = _mm256_loadu_ps(p + 5 * stride);
+    __m256 r9 = _mm256_loadu_ps(p + 6 * stride);
+    v[0] = gsdi_gauss_taps_avx2(w, r0, r1, r2, r3, r4, r5, r6);
+    v[1] = gsdi_gauss_taps_avx2(w, r1, r2, r3, r4, r5, r6, r7);
+    v[2] = gsdi_gauss_taps_avx2(w, r2, r3, r4, r5, r6, r7, r8);
+    v[3] = gsdi_gauss_taps_avx2(w, r3, r4, r5, r6, r7, r8, r9);
+}
+
+#define GSDI_GAUSS_SHIFT_AVX2(high, low, n)                                                                            \
+    _mm256_castsi256_ps(_mm256_alignr_epi8(_mm256_castps_si256(high), _mm256_castps_si256(low), 4 * (n)))
+
+/* Eight columns from the vectors `v`, which starts at column -4, and `next`: -3 .. 10 are numbers 1 .. 14 of the two.
+ */
+GSDI_GAUSS_AVX2_INLINE __m256 gsdi_gauss_row_avx2(const __m256 *w, __m256 v, __m256 next)
+{
+    __m256 middle = _mm256_permute2f128_ps(v, next, 0x21);
+    return gsdi_gauss_taps_avx2(w, GSDI_GAUSS_SHIFT_AVX2(middle, v, 1), GSDI_GAUSS_SHIFT_AVX2(middle, v, 2),
+                                GSDI_GAUSS_SHIFT_AVX2(middle, v, 3), middle, GSDI_GAUSS_SHIFT_AVX2(next, middle, 1),
+                                GSDI_GAUSS_SHIFT_AVX2(next, middle, 2), GSDI_GAUSS_SHIFT_AVX2(next, middle, 3));
+}
+
+/* Rows are written out one by one: a loop over them would put v into memory where the compiler does not unroll. */
+GSDI_GAUSS_AVX2 static inline void gsdi_gauss_full_avx2(const float *in, size_t stride, float *out, size_t out_stride,
+                                                        uint32_t width, uint32_t from, uint32_t to, const float w[4])
+{
+    __m256 weight[4], v[4], next[4];
+    uint32_t r, c;
+    for (r = 0; r < 4; ++r)
+        weight[r] = _mm256_set1_ps(w[r]);
+    for (r = from; r < to; r += GSDI_GAUSS_ROWS) {
+        const float *p = in + r * stride;
+        float *o = out + r * out_stride;
+        gsdi_gauss_columns_avx2(p - 4, stride, weight, v);
+        for (c = 0; c < width; c += 8) {
+            gsdi_gauss_columns_avx2(p + c + 4, stride, weight, next);
+            _mm256_stream_ps(o + c, gsdi_gauss_row_avx2(weight, v[0], next[0]));
+            _mm256_stream_ps(o + out_stride + c, gsdi_gauss_row_avx2(weight, v[1], next[1]));
+            _mm256_stream_ps(o + 2 * out_stride + c, gsdi_gauss_row_avx2(weight, v[2], next[2]));
+            _mm256_stream_ps(o + 3 * out_stride + c, gsdi_gauss_row_avx2(weight, v[3], next[3]));
+            v[0] = next[0];
+            v[1] = next[1];
+            v[2] = next[2];
+            v[3] = next[3];
+        }
+    }
+    _mm_sfence();
+}
+
+/* Two blocks at a time. Stores go through the caches: whoever merges the layers reads them soon. */
+GSDI_GAUSS_AVX2 static inline void gsdi_gauss_packed_avx2(const float *in, size_t stride, float *out,
+                                                          const gsdi_gauss_run *run, size_t count, const float w[4])
+{
+    __m256 weight[4], v[4], next[4], r0, r1, r2, r3;
+    size_t k;
+    uint32_t n;
+    for (k = 0; k < 4; ++k)
+        weight[k] = _mm256_set1_ps(w[k]);
+    for (k = 0; k < count; ++k) {
+        const float *p = in + (size_t)run[k].row * GSDI_GAUSS_ROWS * stride + (size_t)run[k].first * GSDI_GAUSS_COLUMNS;
+        if (k + GSDI_GAUSS_AHEAD < count)
+            gsdi_gauss_prefetch(in, stride, &run[k + GSDI_GAUSS_AHEAD]);
+        gsdi_gauss_columns_avx2(p - 4, stride, weight, v);
+        for (n = (uint32_t)(run[k].end - run[k].first);; n -= 2, p += 8) {
+            gsdi_gauss_columns_avx2(p + 4, stride, weight, next);
+            r0 = gsdi_gauss_row_avx2(weight, v[0], next[0]);
+            r1 = gsdi_gauss_row_avx2(weight, v[1], next[1]);
+            r2 = gsdi_gauss_row_avx2(weight, v[2], next[2]);
+            r3 = gsdi_gauss_row_avx2(weight, v[3], next[3]);
+            _mm256_store_ps(out, _mm256_permute2f128_ps(r0, r1, 0x20));
+            _mm256_store_ps(out + 8, _mm256_permute2f128_ps(r2, r3, 0x20));
+            out += GSDI_GAUSS_BLOCK;
+            if (n == 1)
+                break;
+            _mm256_store_ps(out, _mm256_permute2f128_ps(r0, r1, 0x31));
+            _mm256_store_ps(out + 8, _mm256_permute2f128_ps(r2, r3, 0x31));
+            out += GSDI_GAUSS_BLOCK;
+            if (n == 2)
+                break;
+            v[0] = next[0];
+            v[1] = next[1];
+            v[2] = next[2];
+            v[3] = next[3];
+        }
+    }
+}
+
+GSDI_GAUSS_AVX512_INLINE __m512 gsdi_gauss_taps_avx512(const __m512 *w, __m512 a, __m512 b, __m512 c, __m512 d,
+                                                       __m512 e, __m512 f, __m512 g)
+{
+    __m512 near = _mm512_fmadd_ps(w[1], _mm512_add_ps(c, e), _mm512_mul_ps(w[0], d));
+    return _mm512_fmadd_ps(w[3], _mm512_add_ps(a, g), _mm512_fmadd_ps(w[2], _mm512_add_ps(b, f), near));
+}
+
+GSDI_GAUSS_AVX512_INLINE void gsdi_gauss_columns_avx512(const float *p, size_t stride, const __m512 *w, __m512 v[4])
+{
+    __m512 r0 = _mm512_loadu_ps(p - 3 * stride), r1 = _mm512_loadu_ps(p - 2 * stride);
+    __m512 r2 = _mm512_loadu_ps(p - stride), r3 = _mm512_loadu_ps(p), r4 = _mm512_loadu_ps(p + stride);
+    __m512 r5 = _mm512_loadu_ps(p + 2 * stride), r6 = _mm512_loadu_ps(p + 3 * stride);
+    __m512 r7 = _mm512_loadu_ps(p + 4 * stride), r8 = _mm512_loadu_ps(p + 5 * stride);
+    __m512 r9 = _mm512_loadu_ps(p + 6 * stride);
+    v[0] = gsdi_gauss_taps_avx512(w, r0, r1, r2, r3, r4, r5, r6);
+    v[1] = gsdi_gauss_taps_avx512(w, r1, r2, r3, r4, r5, r6, r7);
+    v[2] = gsdi_gauss_taps_avx512(w, r2, r3, r4, r5, r6, r7, r8);
+    v[3] = gsdi_gauss_taps_avx512(w, r3, r4, r5, r6, r7, r8, r9);
+}
+
+/* The forms with a mask that is always set are the same instructions; g++ 12 warns of the others in C++. */
+#define GSDI_GAUSS_SHIFT_AVX512(high, low, n)                                                                          \
+    _mm512_castsi512_ps(_mm512_maskz_alignr_epi32(0xffff, _mm512_castps_si512(high), _mm512_castps_si512(low), (n)))
+#define GSDI_GAUSS_BLOCKS_AVX512(a, b, n) _mm512_maskz_shuffle_f32x4(0xffff, (a), (b), (n))
+
+/* Sixteen columns from the vectors `low`, which starts at column -16, `v` and `high`; past the caches. */
+GSDI_GAUSS_AVX512_INLINE void gsdi_gauss_row_avx512(const __m512 *w, __m512 low, __m512 v, __m512 high, float *out)
+{
+    _mm512_stream_ps(out,
+                     gsdi_gauss_taps_avx512(w, GSDI_GAUSS_SHIFT_AVX512(v, low, 13), GSDI_GAUSS_SHIFT_AVX512(v, low, 14),
+                                            GSDI_GAUSS_SHIFT_AVX512(v, low, 15), v, GSDI_GAUSS_SHIFT_AVX512(high, v, 1),
+                                            GSDI_GAUSS_SHIFT_AVX512(high, v, 2), GSDI_GAUSS_SHIFT_AVX512(high, v, 3)));
+}
+
+/* Whole rows: three aligned vectors of vertical sums at a time. */
+GSDI_GAUSS_AVX512 static inline void gsdi_gauss_full_avx512(const float *in, size_t stride, float *out,
+                                                            size_t out_stride, uint32_t width, uint32_t from,
+                                                            uint32_t to, const float w[4])
+{
+    __m512 weight[4];
+    uint32_t r, c;
+    for (r = 0; r < 4; ++r)
+        weight[r] = _mm512_set1_ps(w[r]);
+    for (r = from; r < to; r += GSDI_GAUSS_ROWS) {
+        const float *p = in + r * stride;
+        float *o = out + r * out_stride;
+        __m512 low[4], v[4], high[4];
+        gsdi_gauss_columns_avx512(p - 16, stride, weight, low);
+        gsdi_gauss_columns_avx512(p, stride, weight, v);
+        for (c = 0; c < width; c += 16) {
+            gsdi_gauss_columns_avx512(p + c + 16, stride, weight, high);
+            gsdi_gauss_row_avx512(weight, low[0], v[0], high[0], o + c);
+            gsdi_gauss_row_avx512(weight, low[1], v[1], high[1], o + out_stride + c);
+            gsdi_gauss_row_avx512(weight, low[2], v[2], high[2], o + 2 * out_stride + c);
+            gsdi_gauss_row_avx512(weight, low[3], v[3], high[3], o + 3 * out_stride + c);
+            low[0] = v[0];
+            low[1] = v[1];
+            low[2] = v[2];
+            low[3] = v[3];
+            v[0] = high[0];
+            v[1] = high[1];
+            v[2] = high[2];
+            v[3] = high[3];
+        }
+    }
+    _mm_sfence();
+}
+
+/* Sixteen columns from the vectors `v`, which starts at column -4, and `next`. */
+GSDI_GAUSS_AVX512_INLINE __m512 gsdi_gauss_shifted_avx512(const __m512 *w, __m512 v, __m512 next)
+{
+    return gsdi_gauss_taps_avx512(w, GSDI_GAUSS_SHIFT_AVX512(next, v, 1), GSDI_GAUSS_SHIFT_AVX512(next, v, 2),
+                                  GSDI_GAUSS_SHIFT_AVX512(next, v, 3), GSDI_GAUSS_SHIFT_AVX512(next, v, 4),
+                                  GSDI_GAUSS_SHIFT_AVX512(next, v, 5), GSDI_GAUSS_SHIFT_AVX512(next, v, 6),
+                                  GSDI_GAUSS_SHIFT_AVX512(next, v, 7));
+}
+
+/* Four blocks at a time; the last one or two need columns -3 .. 10 at most, which are in v: the usual run, along the
+   border of two leaves, takes one vector of columns only. */
+GSDI_GAUSS_AVX512 static inline void gsdi_gauss_packed_avx512(const float *in, size_t stride, float *out,
+                                                              const gsdi_gauss_run *run, size_t count, const float w[4])
+{
+    __m512 weight[4], v[4], next[4], r0, r1, r2, r3, low01, low23, high01, high23;
+    size_t k;
+    uint32_t n;
+    for (k = 0; k < 4; ++k)
+        weight[k] = _mm512_set1_ps(w[k]);
+    for (k = 0; k < count; ++k) {
+        const float *p = in + (size_t)run[k].row * GSDI_GAUSS_ROWS * stride + (size_t)run[k].first * GSDI_GAUSS_COLUMNS;
+        if (k + GSDI_GAUSS_AHEAD < count)
+            gsdi_gauss_prefetch(in, stride, &run[k + GSDI_GAUSS_AHEAD]);
+        gsdi_gauss_columns_avx512(p - 4, stride, weight, v);
+        for (n = (uint32_t)(run[k].end - run[k].first); n > 2; n = n > 4 ? n - 4 : 0, p += 16) {
+            gsdi_gauss_columns_avx512(p + 12, stride, weight, next);
+            r0 = gsdi_gauss_shifted_avx512(weight, v[0], next[0]);
+            r1 = gsdi_gauss_shifted_avx512(weight, v[1], next[1]);
+            r2 = gsdi_gauss_shifted_avx512(weight, v[2], next[2]);
+            r3 = gsdi_gauss_shifted_avx512(weight, v[3], next[3]);
+            low01 = GSDI_GAUSS_BLOCKS_AVX512(r0, r1, 0x44);
+            low23 = GSDI_GAUSS_BLOCKS_AVX512(r2, r3, 0x44);
+            high01 = GSDI_GAUSS_BLOCKS_AVX512(r0, r1, 0xee);
+            high23 = GSDI_GAUSS_BLOCKS_AVX512(r2, r3, 0xee);
+            _mm512_store_ps(out, GSDI_GAUSS_BLOCKS_AVX512(low01, low23, 0x88));
+            _mm512_store_ps(out + GSDI_GAUSS_BLOCK, GSDI_GAUSS_BLOCKS_AVX512(low01, low23, 0xdd));
+            _mm512_store_ps(out + 2 * GSDI_GAUSS_BLOCK, GSDI_GAUSS_BLOCKS_AVX512(high01, high23, 0x88));
+            if (n > 3)
+                _mm512_store_ps(out + 3 * GSDI_GAUSS_BLOCK, GSDI_GAUSS_BLOCKS_AVX512(high01, high23, 0xdd));
+            out += (n > 3 ? 4 : 3) * GSDI_GAUSS_BLOCK;
+            v[0] = next[0];
+            v[1] = next[1];
+            v[2] = next[2];
+            v[3] = next[3];
+        }
+        if (!n)
+            continue;
+        r0 = gsdi_gauss_shifted_avx512(weight, v[0], v[0]);
+        r1 = gsdi_gauss_shifted_avx512(weight, v[1], v[1]);
+        r2 = gsdi_gauss_shifted_avx512(weight, v[2], v[2]);
+        r3 = gsdi_gauss_shifted_avx512(weight, v[3], v[3]);
+        low01 = GSDI_GAUSS_BLOCKS_AVX512(r0, r1, 0x44);
+        low23 = GSDI_GAUSS_BLOCKS_AVX512(r2, r3, 0x44);
+        _mm512_store_ps(out, GSDI_GAUSS_BLOCKS_AVX512(low01, low23, 0x88));
+        if (n > 1)
+            _mm512_store_ps(out + GSDI_GAUSS_BLOCK, GSDI_GAUSS_BLOCKS_AVX512(low01, low23, 0xdd));
+        out += n * GSDI_GAUSS_BLOCK;
+    }
+}
+#endif
+
+#if GSDI_NEON
+static inline float32x4_t gsdi_gauss_taps_neon(const float32x4_t *w, const float32x4_t *r)
+{
+    float32x4_t near = vfmaq_f32(vmulq_f32(w[0], r[3]), w[1], vaddq_f32(r[2], r[4]));
+    return vfmaq_f32(vfmaq_f32(near, w[2], vaddq_f32(r[1], r[5])), w[3], vaddq_f32(r[0], r[6]));
+}
+
+/* Vertical sums of four rows at four columns from p on, p in the first row. */
+static inline void gsdi_gauss_columns_neon(const float *p, size_t stride, const float32x4_t *w, float32x4_t v[4])
+{
+    float32x4_t r[10];
+    uint32_t i;
+    p -= 3 * stride;
+    for (i = 0; i < 10; ++i)
+        r[i] = vld1q_f32(p + i * stride);
+    for (i = 0; i < 4; ++i)
+        v[i] = gsdi_gauss_taps_neon(w, r + i);
+}
+
+/* Four columns from the vectors before, at and after them. */
+static inline float32x4_t gsdi_gauss_row_neon(const float32x4_t *w, float32x4_t low, float32x4_t v, float32x4_t high)
+{
+    float32x4_t r[7];
+    r[0] = vextq_f32(low, v, 1);
+    r[1] = vextq_f32(low, v, 2);
+    r[2] = vextq_f32(low, v, 3);
+    r[3] = v;
+    r[4] = vextq_f32(v, high, 1);
+    r[5] = vextq_f32(v, high, 2);
+    r[6] = vextq_f32(v, high, 3);
+    return gsdi_gauss_taps_neon(w, r);
+}
+
+/* A strip of four rows, `blocks` blocks long, each written `step` floats after the one before. */
+static inline void gsdi_gauss_strip_neon(const float *p, size_t stride, float *out, size_t out_stride, size_t step,
+                                         uint32_t blocks, const float32x4_t *w)
+{
+    float32x4_t low[4], v[4], high[4];
+    uint32_t i;
+    gsdi_gauss_columns_neon(p - 4, stride, w, low);
+    gsdi_gauss_columns_neon(p, stride, w, v);
+    for (; blocks; --blocks, out += step) {
+        p += 4;
+        gsdi_gauss_columns_neon(p, stride, w, high);
+        for (i = 0; i < 4; ++i) {
+            vst1q_f32(out + i * out_stride, gsdi_gauss_row_neon(w, low[i], v[i], high[i]));
+            low[i] = v[i];
+            v[i] = high[i];
+        }
+    }
+}
+
+static inline void gsdi_gauss_full_neon(const float *in, size_t stride, float *out, size_t out_stride, uint32_t width,
+                                        uint32_t from, uint32_t to, const float w[4])
+{
+    float32x4_t weight[4];
+    uint32_t r;
+    for (r = 0; r < 4; ++r)
+        weight[r] = vdupq_n_f32(w[r]);
+    for (r = from; r < to; r += GSDI_GAUSS_ROWS)
+        gsdi_gauss_strip_neon(in + r * stride, stride, out + r * out_stride, out_stride, GSDI_GAUSS_COLUMNS,
+                              width / GSDI_GAUSS_COLUMNS, weight);
+}
+
+static inline void gsdi_gauss_packed_neon(const float *in, size_t stride, float *out, const gsdi_gauss_run *run,
+                                          size_t count, const float w[4])
+{
+    float32x4_t weight[4];
+    size_t k;
+    for (k = 0; k < 4; ++k)
+        weight[k] = vdupq_n_f32(w[k]);
+    for (k = 0; k < count; ++k) {
+        uint32_t blocks = (uint32_t)(run[k].end - run[k].first);
+        const float *p = in + (size_t)run[k].row * GSDI_GAUSS_ROWS * stride + (size_t)run[k].first * GSDI_GAUSS_COLUMNS;
+        if (k + GSDI_GAUSS_AHEAD < count)
+            gsdi_gauss_prefetch(in, stride, &run[k + GSDI_GAUSS_AHEAD]);
+        gsdi_gauss_strip_neon(p, stride, out, GSDI_GAUSS_COLUMNS, GSDI_GAUSS_BLOCK, blocks, weight);
+        out += (size_t)blocks * GSDI_GAUSS_BLOCK;
+    }
+}
+#endif
+
+/* The whole of a layer at a SIMD level. */
+static void gsdi_gauss_full(gsd_simd simd, const float *in, float *out, uint32_t width, const float w[4])
+{
+    size_t stride = gsdi_gauss_stride(width);
+#if GSDI_X86
+    if (simd == GSD_SIMD_AVX512)
+        gsdi_gauss_full_avx512(in, stride, out, width, width, 0, width, w);
+    else if (simd == GSD_SIMD_AVX2)
+        gsdi_gauss_full_avx2(in, stride, out, width, width, 0, width, w);
+    else
+#elif GSDI_NEON
+    if (simd == GSD_SIMD_NEON)
+        gsdi_gauss_full_neon(in, stride, out, width, width, 0, width, w);
+    else
+#endif
+        gsdi_gauss_full_scalar(in, stride, out, width, width, 0, width, w);
+    (void)simd;
+}
+
+/* Runs of blocks of a layer, packed, at a SIMD level. */
+static void gsdi_gauss_packed(gsd_simd simd, const float *in, float *out, uint32_t width, const gsdi_gauss_run *run,
+                              size_t count, const float w[4])
+{
+    size_t stride = gsdi_gauss_stride(width);
+#if GSDI_X86
+    if (simd == GSD_SIMD_AVX512)
+        gsdi_gauss_packed_avx512(in, stride, out, run, count, w);
+    else if (simd == GSD_SIMD_AVX2)
+        gsdi_gauss_packed_avx2(in, stride, out, run, count, w);
+    else
+#elif GSDI_NEON
+    if (simd == GSD_SIMD_NEON)
+        gsdi_gauss_packed_neon(in, stride, out, run, count, w);
+    else
+#endif
+        gsdi_gauss_packed_scalar(in, stride, out, run, count, w);
+    (void)simd;
+}
+
+/* What one tree is blurred in, for trees down to some depth. While layer d is at hand, matrix[(depth - d) & 1] holds it
+   and the other one the layers above, merged. */
+typedef struct gsdi_gauss_slot {
+    void *memory;
+    float *matrix[2]; /* element (0, 0); 2^depth and 2^(depth - 1) wide, with margins */
+    float *packed;    /* [4^depth] blurred blocks or, where most are, rows; at last the sums over the merged matrix */
+    uint64_t *map;
+    gsdi_gauss_run *run;
+    uint32_t cell;
+    uint32_t depth; /* of that cell's tree */
+    uint32_t nodes; /* of its new tree; 0 = leave it alone */
+} gsdi_gauss_slot;
+
+/* Bytes of the five parts of a slot, each a multiple of a cache line. */
+static uint64_t gsdi_gauss_parts(uint32_t depth, uint64_t bytes[5])
+{
+    uint32_t width = 1u << depth, k;
+    uint64_t sum = 64;
+    bytes[0] = gsdi_gauss_floats(width) * sizeof(float);
+    bytes[1] = gsdi_gauss_floats(width / 2) * sizeof(float);
+    bytes[2] = (uint64_t)width * width * sizeof(float);
+    bytes[3] = gsdi_gauss_map_words(width) * sizeof(uint64_t);
+    bytes[4] = (uint64_t)width / GSDI_GAUSS_ROWS * (width / 8) * sizeof(gsdi_gauss_run);
+    for (k = 0; k < 5; ++k)
+        sum += bytes[k] = (bytes[k] + 63) & ~(uint64_t)63;
+    return sum;
+}
+
+/* Cut a slot's memory into its parts. */
+static void gsdi_gauss_slot_cut(gsdi_gauss_slot *slot, uint32_t depth)
+{
+    uint64_t bytes[5];
+    char *at = (char *)slot->memory + ((64 - ((uintptr_t)slot->memory & 63)) & 63);
+    gsdi_gauss_parts(depth, bytes);
+    slot->matrix[0] = (float *)(void *)at + gsdi_gauss_origin(1u << depth);
+    slot->matrix[1] = (float *)(void *)(at += bytes[0]) + gsdi_gauss_origin(1u << (depth - 1));
+    slot->packed = (float *)(void *)(at += bytes[1]);
+    slot->map = (uint64_t *)(void *)(at += bytes[2]);
+    slot->run = (gsdi_gauss_run *)(void *)(at + bytes[3]);
+}
+
+/* Elements in all layers of a tree of this depth: the work of denoising it. */
+static double gsdi_gauss_work(uint32_t depth)
+{
+    double work = 0;
+    uint32_t layer;
+    for (layer = GSDI_GAUSS_FIRST; layer <= depth; ++layer)
+        work += ldexp(1, 2 * (int)layer);
+    return work;
+}
+
+/* Halvings from every node to the deepest leaf below it. */
+static void gsdi_gauss_heights(const uint32_t *child, uint32_t count, unsigned char *height)
+{
+    uint32_t i, k;
+    for (i = count; i-- > 0;) {
+        uint32_t c = child[i], most = 0;
+        for (k = 0; c && k < 4; ++k)
+            most = height[c + k] > most ? height[c + k] : most;
+        height[i] = (unsigned char)(c ? 1 + most : 0);
+    }
+}
+
+/* A layer as a matrix of shares of the tree's mass: leaves above it are split by area, a subtree below an element
+   counts with its sum times 4^-(its depth). Shares below 1e-30 count as 0: sums of them could only be denormal. */
+static void gsdi_gauss_flatten(const uint32_t *child, const double *mass, const unsigned char *height, uint32_t layer,
+                               float *m, size_t stride)
+{
+    gsdi_square stack[GSDI_STACK];
+    uint32_t top = 1, k, r, i;
+    double scale = 1 / mass[0];
+    memset(&stack[0], 0, sizeof stack[0]);
+    stack[0].size = 1u << layer;
+    while (top) {
+        gsdi_square b = stack[--top];
+        uint32_t c = child[b.node], half = b.size / 2;
+        double parts = c ? (double)((uint64_t)1 << (2 * height[b.node])) : (double)b.size * (double)b.size;
+        float value = (float)(mass[b.node] * scale / parts);
+        for (k = 4; c && half && k-- > 0;) {
+            gsdi_square *s = &stack[top++];
+            s->node = c + k;
+            s->x = b.x + (k & 1) * half;
+            s->y = b.y + (k >> 1) * half;
+            s->size = half;
+        }
+        if (c && half)
+            continue;
+        value = value >= 1e-30f ? value : 0; /* NaN too, where a loaded tree's mass is infinite */
+        for (r = b.y; r < b.y + b.size; ++r)
+            for (i = b.x; i < b.x + b.size; ++i)
+                m[r * stride + i] = value;
+    }
+}
+
+/* Put packed blocks to their places. */
+static void gsdi_gauss_unpack(const float *packed, const gsdi_gauss_run *run, size_t count, float *m, size_t stride)
+{
+    size_t i, r;
+    uint32_t b;
+    for (i = 0; i < count; ++i)
+        for (b = run[i].first; b < run[i].end; ++b, packed += GSDI_GAUSS_BLOCK)
+            for (r = 0; r < GSDI_GAUSS_ROWS; ++r)
+                memcpy(m + (run[i].row * GSDI_GAUSS_ROWS + r) * stride + (size_t)b * GSDI_GAUSS_COLUMNS,
+                       packed + r * GSDI_GAUSS_COLUMNS, GSDI_GAUSS_COLUMNS * sizeof(float));
+}
+
+/* The larger of a layer and what the layers above it say, expanded: a quarter for each of four elements. above: NULL =
+   this is the first one. from may be to. */
+static void gsdi_gauss_merge(const float *from, size_t from_stride, const float *above, float *to, uint32_t width)
+{
+    size_t stride = gsdi_gauss_stride(width), above_stride = gsdi_gauss_stride(width / 2);
+    uint32_t r, c;
+    for (r = 0; r < width; ++r) {
+        const float *f = from + r * from_stride, *a = above ? above + r / 2 * above_stride : f;
+        float *t = to + r * stride;
+        for (c = 0; above && c < width / 2; ++c) {
+            float x = f[2 * c], y = f[2 * c + 1], z = 0.25f * a[c];
+            t[2 * c] = x > z ? x : z;
+            t[2 * c + 1] = y > z ? y : z;
+        }
+        if (!above && f != t)
+            memcpy(t, f, width * sizeof *t);
+    }
+}
+
+/* Flatten, blur and merge one layer. */
+static void gsdi_gauss_layer(gsdi_gauss_slot *slot, const uint32_t *child, const double *mass,
+                             const unsigned char *height, uint32_t layer, gsd_simd simd, bool sphere, const float w[4])
+{
+    uint32_t width = 1u << layer, parity = (slot->depth - layer) & 1;
+    float *m = slot->matrix[parity];
+    size_t stride = gsdi_gauss_stride(width), runs, blocks = 0, i;
+    bool whole;
+    gsdi_gauss_flatten(child, mass, height, layer, m, stride);
+    gsdi_gauss_pad(m, stride, width, sphere);
+    gsdi_gauss_map(child, layer, slot->map);
+    runs = gsdi_gauss_runs(slot->map, width, 0, width / GSDI_GAUSS_ROWS, slot->run);
+    for (i = 0; i < runs; ++i)
+        blocks += (size_t)(slot->run[i].end - slot->run[i].first);
+    whole = blocks * GSDI_GAUSS_BLOCK * 4 > (size_t)width * width * 3;
+    if (whole) {
+        gsdi_gauss_full(simd, m, slot->packed, width, w);
+    } else {
+        gsdi_gauss_packed(simd, m, slot->packed, width, slot->run, runs, w);
+        gsdi_gauss_unpack(slot->packed, slot->run, runs, m, stride);
+    }
+    gsdi_gauss_merge(whole ? slot->packed : m, whole ? width : stride,
+                     layer > GSDI_GAUSS_FIRST ? slot->matrix[1 - parity] : NULL, m, width);
+}
+
+/* Sums of the merged matrix over the squares of all layers above: layer d from (4^d - 1) / 3 on, 2^d wide. */
+static void gsdi_gauss_sums(gsdi_gauss_slot *slot)
+{
+    const float *from = slot->matrix[0];
+    size_t stride = gsdi_gauss_stride(1u << slot->depth), x, y;
+    uint32_t d;
+    for (d = slot->depth; d-- > 0;) {
+        size_t width = (size_t)1 << d;
+        float *to = slot->packed + (((size_t)1 << (2 * d)) - 1) / 3;
+        for (y = 0; y < width; ++y)
+            for (x = 0; x < width; ++x) {
+                const float *a = from + 2 * y * stride + 2 * x, *b = a + stride;
+                to[y * width + x] = (a[0] + a[1]) + (b[0] + b[1]);
+            }
+        from = to;
+        stride = width;
+    }
+}
+
+/* All layers of one tree: the merged matrix and its sums. */
+static void gsdi_gauss_blur(gsdi_gauss_slot *slot, const uint32_t *child, const double *mass,
+                            const unsigned char *height, gsd_simd simd, bool sphere, const float w[4])
+{
+    uint32_t layer;
+    for (layer = GSDI_GAUSS_FIRST; layer <= slot->depth; ++layer)
+        gsdi_gauss_layer(slot, child, mass, height, layer, simd, sphere, w);
+    gsdi_gauss_sums(slot);
+}
+
+/* The tree of a merged matrix: the root is divided, others where they hold more than rho of the sum, down to the
+   matrix's elements; below, light is even. old, sum: the tree that was blurred; its sums go to the new one by area.
+   child NULL: count only; else mass is the matrix's. Returns the number of nodes, 0 = the matrix is empty. */
+static uint32_t gsdi_gauss_rebuild(const gsdi_gauss_slot *slot, double rho, const uint32_t *old,
+                                   const gsdi_sum *old_sum, uint32_t *child, gsdi_sum *sum, double *mass)
+{
+    gsdi_visit stack[GSDI_STACK];
+    double limit = rho * (double)slot->packed[0];
+    uint32_t total = 1, k;
+    int top = 0;
+    memset(&stack[0], 0, sizeof stack[0]);
+    stack[0].sum = old_sum[0];
+    while (limit > 0 && top >= 0) {
+        gsdi_visit v = stack[top--];
+        size_t width = (size_t)1 << v.depth;
+        const float *m = v.depth < slot->depth ? slot->packed + (((size_t)1 << (2 * v.depth)) - 1) / 3 + v.y * width
+                                               : slot->matrix[0] + v.y * gsdi_gauss_stride(1u << v.depth);
+        bool divide = v.depth == 0 || (v.depth < slot->depth && (double)m[v.x] > limit);
+        if (child) {
+            child[v.out] = divide ? total : 0;
+            sum[v.out] = v.sum;
+            mass[v.out] = (double)m[v.x];
+        }
+        for (k = 4; divide && k-- > 0;) {
+            gsdi_visit *next = &stack[++top];
+            uint32_t c = v.node == GSDI_NONE ? 0 : old[v.node];
+            next->node = c ? c + k : GSDI_NONE;
+            next->depth = v.depth + 1;
+            next->x = 2 * v.x + (k & 1);
+            next->y = 2 * v.y + (k >> 1);
+            next->out = total + k;
+            next->sum.half[0] = c ? old_sum[next->node].half[0] : v.sum.half[0] * 0.25;
+            next->sum.half[1] = c ? old_sum[next->node].half[1] : v.sum.half[1] * 0.25;
+        }
+        total += divide ? 4 : 0;
+    }
+    return limit > 0 ? total : 0;
+}
+
+/* Scale masses so that the root has `total`; inner nodes become the sums of their children. */
+static void gsdi_gauss_normalise(const uint32_t *child, double *mass, uint32_t count, double total)
+{
+    double sum = 0;
+    uint32_t i;
+    for (i = 0; i < count; ++i)
+        sum += child[i] ? 0 : mass[i];
+    for (i = count; i-- > 0;) {
+        const double *c = mass + child[i];
+        mass[i] = child[i] ? (c[0] + c[1]) + (c[2] + c[3]) : mass[i] * (total / sum);
+    }
 }
 
 /* ---- >>accumulate ------------------------------------------------------------------------------------------- */
@@ -2372,14 +3227,19 @@ static void gsdi_tree_copy(gsdi_block *b, gsdi_tree *tree, gsdi_block *from, con
 
 /* What refine decides about an old cell. */
 typedef struct gsdi_job {
-    double blur;       /* of its tree; 0 = not denoised */
-    double limit_mass; /* total mass of its building tree */
-    uint32_t rebuild;  /* 1: new sampling tree from the building tree */
-    uint32_t denoise;  /* 1: blur it first */
-    uint32_t groups;   /* of that tree */
-    uint32_t nodes;    /* of the next building tree */
-    uint32_t tree;     /* index of its sampling tree in the new block */
-    uint32_t copy;     /* 1: this job copies that tree from the old block */
+    double blur;           /* of its tree; 0 = not denoised */
+    double limit_mass;     /* total mass of its building tree */
+    uint32_t rebuild;      /* 1: new sampling tree from the building tree */
+    uint32_t denoise;      /* 1: blur it first */
+    uint32_t height;       /* Gaussian: halvings of the deepest leaf */
+    uint32_t groups;       /* of that tree */
+    uint32_t nodes;        /* of the next building tree */
+    uint32_t tree;         /* index of its sampling tree in the new block */
+    uint32_t copy;         /* 1: this job copies that tree from the old block */
+    const uint32_t *child; /* its building tree: the field's, or the one that the Gaussian denoiser made of it */
+    const gsdi_sum *sum;
+    double *mass;
+    void *made; /* memory of such a tree */
 } gsdi_job;
 
 /* Building nodes of the new cells that have one sampling tree: all, and of the smallest; a single leaf counts 0. */
@@ -2409,7 +3269,10 @@ typedef struct gsdi_refinement {
     double *mass;         /* [building nodes] */
     unsigned char *depth; /* [building nodes] */
     float *blur;          /* [GSDI_BLUR_FLOATS * building nodes], while denoising */
+    uint64_t blur_bytes;  /* most that denoising held, gone when the structure is planned */
+    uint64_t made_bytes;  /* of the trees that the Gaussian denoiser made, until the new part stands */
     gsdi_place *places;   /* [cells] */
+    uint32_t old_cells;   /* [jobs] */
     uint32_t cells, cell_limit, place_capacity;
     uint32_t *spatial; /* [spatial_count] */
     uint32_t spatial_count, spatial_capacity;
@@ -2428,6 +3291,9 @@ typedef struct gsdi_refinement {
 
 static void gsdi_refinement_free(gsdi_refinement *r)
 {
+    uint32_t c;
+    for (c = 0; r->jobs && c < r->old_cells; ++c)
+        gsdi_release(r->desc, r->jobs[c].made);
     gsdi_release(r->desc, r->jobs);
     gsdi_release(r->desc, r->mass);
     gsdi_release(r->desc, r->depth);
@@ -2454,6 +3320,17 @@ static void gsdi_step(const gsdi_refinement *r, const char *step)
         r->pass->on_step(r->pass->on_step_user, step);
 }
 
+/* Work on an old cell's building tree as the field has it. */
+static void gsdi_job_old_tree(const gsdi_refinement *r, uint32_t c)
+{
+    const gsdi_state *s = &r->field->states[c];
+    gsdi_job *job = &r->jobs[c];
+    job->child = r->field->child + s->first;
+    job->sum = r->field->sum + s->first;
+    job->mass = r->mass + s->first;
+    job->groups = (s->count - 1) / 4;
+}
+
 /* Masses of the old cells' building trees; whether to rebuild. */
 static void gsdi_measure(void *context, uint32_t begin, uint32_t end)
 {
@@ -2463,12 +3340,12 @@ static void gsdi_measure(void *context, uint32_t begin, uint32_t end)
         const gsdi_state *s = &r->field->states[c];
         gsdi_job *job = &r->jobs[c];
         job->nodes = s->count;
+        gsdi_job_old_tree(r, c);
         if (s->fresh <= 0)
             continue;
-        job->limit_mass = gsdi_tree_masses(r->field->child + s->first, r->field->sum + s->first, s->count,
-                                           r->second_moment, r->mass + s->first, r->depth + s->first);
+        job->limit_mass = gsdi_tree_masses(job->child, r->field->sum + s->first, s->count, r->second_moment, job->mass,
+                                           r->depth + s->first);
         job->rebuild = s->held >= (double)r->desc->min_samples && job->limit_mass > 1e-280;
-        job->groups = (s->count - 1) / 4;
     }
 }
 
@@ -2482,9 +3359,8 @@ static void gsdi_denoise_range(void *context, uint32_t begin, uint32_t end)
         gsdi_blur b;
         if (!job->denoise)
             continue;
-        b = gsdi_blur_make(r->blur + GSDI_BLUR_FLOATS * (size_t)s->first, s->count, r->mass + s->first);
-        job->blur = gsdi_blur_tree(r->field->child + s->first, r->field->sum + s->first, r->depth + s->first, s->count,
-                                   r->second_moment, &b);
+        b = gsdi_blur_make(r->blur + GSDI_BLUR_FLOATS * (size_t)s->first, s->count, job->mass);
+        job->blur = gsdi_blur_tree(job->child, job->sum, r->depth + s->first, s->count, r->second_moment, &b);
         job->limit_mass = b.mass[0];
     }
 }
@@ -2516,13 +3392,12 @@ static void gsdi_denoise_choose(gsdi_refinement *r)
     }
 }
 
-/* Denoise the masses of the old cells' building trees. False = out of memory. */
+/* Move the masses of the old cells' building trees towards their surroundings. False = out of memory. */
 static bool gsdi_denoise(gsdi_refinement *r, gsd_parallel_fn parallel, void *user)
 {
     uint32_t cells = r->field->block->cells, i;
     double blur = 0;
-    if (r->denoise == GSD_DENOISE_OFF)
-        return true;
+    r->blur_bytes = r->field->building_nodes * (uint64_t)GSDI_BLUR_FLOATS * sizeof(float);
     r->blur = (float *)gsdi_allocate(r->desc, r->field->building_nodes, GSDI_BLUR_FLOATS * sizeof(float));
     if (!r->blur)
         return false;
@@ -2539,17 +3414,231 @@ static bool gsdi_denoise(gsdi_refinement *r, gsd_parallel_fn parallel, void *use
     return true;
 }
 
+/* Bytes that refine holds beside the old and the new part. */
+static uint64_t gsdi_refine_scratch(const gsdi_block *old, uint64_t nodes, uint64_t places, uint64_t spatial)
+{
+    return old->cells * sizeof(gsdi_job) + nodes * (sizeof(double) + 1) + places * sizeof(gsdi_place) + spatial * 4 +
+           ((uint64_t)old->cells + 1) * (sizeof(gsdi_tree) + sizeof(gsdi_need)) + old->trees * sizeof(uint32_t);
+}
+
+/* Bytes of the parts that refine replaces, with their room to grow. */
+static uint64_t gsdi_old_bytes(const gsd_field *f)
+{
+    return gsdi_bytes(f->block, f->node_capacity) + (f->state_capacity - f->block->cells) * sizeof(gsdi_state);
+}
+
+/* The Gaussian denoiser at work on some trees at once. */
+typedef struct gsdi_gauss {
+    gsdi_refinement *r;
+    gsdi_gauss_slot slot[GSDI_GAUSS_SLOTS];
+    uint32_t slots, used; /* there are; with a tree in them */
+    uint32_t chosen;      /* trees */
+    uint32_t depth;       /* of the deepest */
+    uint32_t next;        /* cell to look at */
+    uint64_t made_limit;  /* bytes */
+    float w[4];
+} gsdi_gauss;
+
+static void gsdi_gauss_measure(void *context, uint32_t begin, uint32_t end)
+{
+    gsdi_refinement *r = (gsdi_refinement *)context;
+    uint32_t c;
+    for (c = begin; c < end; ++c) {
+        const gsdi_state *s = &r->field->states[c];
+        if (!r->jobs[c].rebuild)
+            continue;
+        gsdi_gauss_heights(r->jobs[c].child, s->count, r->depth + s->first); /* depths were for the masses only */
+        r->jobs[c].height = r->depth[s->first];
+    }
+}
+
+/* Choose the trees: in the order of the cells, each that is neither too deep nor more work than is left. What a tree
+   and its slot may take of max_bytes does not depend on how many are blurred at once. */
+static void gsdi_gauss_choose(gsdi_gauss *g)
+{
+    gsdi_refinement *r = g->r;
+    const gsd_field *f = r->field;
+    uint64_t held = gsdi_old_bytes(f) + gsdi_refine_scratch(f->block, f->building_nodes, 0, 0), bytes[5];
+    uint64_t room = r->desc->max_bytes > held ? (r->desc->max_bytes - held) / 2 : 0, cap = r->desc->max_bytes / 4, each;
+    bool limit = !r->desc->gaussian_no_limit;
+    double left = ldexp(GSDI_GAUSS_WORK, f->passes < 900 ? (int)f->passes : 900);
+    uint32_t c;
+    g->made_limit = room < cap / 2 ? room : cap / 2;
+    room = room < cap ? room : cap;
+    for (c = 0; c < r->old_cells; ++c) {
+        gsdi_job *job = &r->jobs[c];
+        double work = gsdi_gauss_work(job->height);
+        if (!job->rebuild)
+            continue;
+        if (job->height < GSDI_GAUSS_FIRST) {
+            r->stats.shallow_trees++;
+        } else if (job->height > (limit ? GSDI_GAUSS_DEEPEST : GSDI_GAUSS_MOST)) {
+            r->stats.deep_trees++;
+        } else if ((limit && work > left) || gsdi_gauss_parts(job->height, bytes) > room) {
+            r->stats.over_budget_trees++;
+        } else {
+            left -= work;
+            job->denoise = 1;
+            g->chosen++;
+            g->depth = job->height > g->depth ? job->height : g->depth;
+        }
+    }
+    if (!g->chosen)
+        return;
+    each = gsdi_gauss_parts(g->depth, bytes);
+    g->slots = g->chosen < GSDI_GAUSS_SLOTS ? g->chosen : GSDI_GAUSS_SLOTS;
+    g->slots = (uint64_t)g->slots * each > room ? (uint32_t)(room / each) : g->slots;
+    r->blur_bytes = g->slots * each;
+}
+
+/* Memory of the slots; one is enough where nothing runs beside it. */
+static bool gsdi_gauss_open(gsdi_gauss *g, bool parallel)
+{
+    const gsd_desc *desc = g->r->desc;
+    uint64_t bytes[5], each = gsdi_gauss_parts(g->depth, bytes);
+    uint32_t i;
+    g->slots = parallel ? g->slots : 1;
+    for (i = 0; i < g->slots; ++i) {
+        g->slot[i].memory = desc->allocate(desc->user, (size_t)each); /* not zeroed: all is written before it is read */
+        if (!g->slot[i].memory)
+            return false;
+        gsdi_gauss_slot_cut(&g->slot[i], g->depth);
+    }
+    return true;
+}
+
+static void gsdi_gauss_blur_range(void *context, uint32_t begin, uint32_t end)
+{
+    gsdi_gauss *g = (gsdi_gauss *)context;
+    const gsdi_refinement *r = g->r;
+    uint32_t i;
+    for (i = begin; i < end; ++i) {
+        gsdi_gauss_slot *slot = &g->slot[i];
+        const gsdi_job *job = &r->jobs[slot->cell];
+        gsdi_gauss_blur(slot, job->child, job->mass, r->depth + r->field->states[slot->cell].first, r->desc->simd,
+                        r->desc->gaussian_sphere, g->w);
+        slot->nodes = gsdi_gauss_rebuild(slot, (double)r->desc->gaussian_rho, job->child, job->sum, NULL, NULL, NULL);
+    }
+}
+
+/* Bytes of a tree of so many nodes: masses, sums, children. */
+static uint64_t gsdi_made_bytes(uint64_t nodes)
+{
+    return nodes * (sizeof(double) + sizeof(gsdi_sum) + sizeof(uint32_t));
+}
+
+/* Memory for the trees of the slots; those for which there is no room are left alone. */
+static bool gsdi_gauss_make(gsdi_gauss *g)
+{
+    gsdi_refinement *r = g->r;
+    uint32_t i;
+    for (i = 0; i < g->used; ++i) {
+        gsdi_gauss_slot *slot = &g->slot[i];
+        uint64_t bytes = gsdi_made_bytes(slot->nodes);
+        if (slot->nodes == 0 || r->made_bytes + bytes > g->made_limit)
+            continue;
+        r->jobs[slot->cell].made = r->desc->allocate(r->desc->user, (size_t)bytes);
+        if (!r->jobs[slot->cell].made)
+            return false;
+        r->made_bytes += bytes;
+    }
+    return true;
+}
+
+static void gsdi_gauss_make_range(void *context, uint32_t begin, uint32_t end)
+{
+    gsdi_gauss *g = (gsdi_gauss *)context;
+    uint32_t i;
+    for (i = begin; i < end; ++i) {
+        const gsdi_gauss_slot *slot = &g->slot[i];
+        gsdi_job *job = &g->r->jobs[slot->cell];
+        double *mass = (double *)job->made;
+        gsdi_sum *sum;
+        uint32_t *child;
+        if (!mass)
+            continue;
+        sum = (gsdi_sum *)(void *)(mass + slot->nodes);
+        child = (uint32_t *)(void *)(sum + slot->nodes);
+        gsdi_gauss_rebuild(slot, (double)g->r->desc->gaussian_rho, job->child, job->sum, child, sum, mass);
+        gsdi_gauss_normalise(child, mass, slot->nodes, job->limit_mass);
+        job->child = child;
+        job->sum = sum;
+        job->mass = mass;
+        job->groups = (slot->nodes - 1) / 4;
+    }
+}
+
+/* Put the next trees into the slots; false = there are none. */
+static bool gsdi_gauss_fill(gsdi_gauss *g)
+{
+    for (g->used = 0; g->next < g->r->old_cells && g->used < g->slots; ++g->next)
+        if (g->r->jobs[g->next].denoise) {
+            gsdi_gauss_slot *slot = &g->slot[g->used++];
+            slot->cell = g->next;
+            slot->depth = g->r->jobs[g->next].height;
+        }
+    return g->used > 0;
+}
+
+/* Make blurred trees of the old cells' building trees. Allocations are made between the parallel parts, one for each
+   tree, so that neither they nor the result depend on the number of slots. False = out of memory. */
+static bool gsdi_gauss_denoise(gsdi_refinement *r, gsd_parallel_fn parallel, void *user)
+{
+    gsdi_gauss g;
+    bool ok;
+    uint32_t i;
+    memset(&g, 0, sizeof g);
+    g.r = r;
+    gsdi_gauss_weights((double)r->desc->gaussian_sigma, g.w);
+    gsdi_run(parallel, user, r->old_cells, 16, gsdi_gauss_measure, r);
+    gsdi_gauss_choose(&g);
+    if (!g.chosen)
+        return true;
+    for (ok = gsdi_gauss_open(&g, parallel != NULL); ok && gsdi_gauss_fill(&g);) {
+        gsdi_run(parallel, user, g.used, 1, gsdi_gauss_blur_range, &g);
+        ok = gsdi_gauss_make(&g);
+        if (ok)
+            gsdi_run(parallel, user, g.used, 1, gsdi_gauss_make_range, &g);
+    }
+    for (i = 0; i < g.slots; ++i)
+        gsdi_release(r->desc, g.slot[i].memory);
+    for (i = 0; i < r->old_cells; ++i)
+        r->stats.denoised_trees += r->jobs[i].made != NULL;
+    r->stats.over_budget_trees += g.chosen - r->stats.denoised_trees;
+    return ok;
+}
+
+/* Take back half of the trees that the Gaussian denoiser made, the last ones. False: there is none. */
+static bool gsdi_gauss_give_back(gsdi_refinement *r)
+{
+    uint32_t back = r->stats.denoised_trees - r->stats.denoised_trees / 2, c = r->old_cells, left = back;
+    if (r->denoise != GSD_DENOISE_GAUSSIAN || !back)
+        return false;
+    while (left) {
+        gsdi_job *job = &r->jobs[--c];
+        if (!job->made)
+            continue;
+        r->made_bytes -= gsdi_made_bytes(job->groups * (uint64_t)4 + 1);
+        gsdi_release(r->desc, job->made);
+        job->made = NULL;
+        gsdi_job_old_tree(r, c);
+        --left;
+    }
+    r->stats.denoised_trees -= back;
+    r->stats.over_budget_trees += back;
+    return true;
+}
+
 /* Sizes of the next building trees at the present rho. */
 static void gsdi_count_nodes(void *context, uint32_t begin, uint32_t end)
 {
     gsdi_refinement *r = (gsdi_refinement *)context;
     uint32_t c;
     for (c = begin; c < end; ++c) {
-        const gsdi_state *s = &r->field->states[c];
         gsdi_job *job = &r->jobs[c];
         if (job->rebuild)
-            job->nodes = gsdi_refine_tree(r->field->child + s->first, r->field->sum + s->first, r->mass + s->first,
-                                          r->rho * job->limit_mass, r->desc->max_depth, 0, NULL, NULL);
+            job->nodes = gsdi_refine_tree(job->child, job->sum, job->mass, r->rho * job->limit_mass, r->desc->max_depth,
+                                          0, NULL, NULL);
     }
 }
 
@@ -2684,22 +3773,16 @@ static uint64_t gsdi_place_nodes(gsdi_refinement *r)
     return total;
 }
 
-/* Bytes that refine holds beside the old and the new part. */
-static uint64_t gsdi_refine_scratch(const gsdi_block *old, uint64_t nodes, uint64_t places, uint64_t spatial)
-{
-    return old->cells * sizeof(gsdi_job) + nodes * (sizeof(double) + 1) + places * sizeof(gsdi_place) + spatial * 4 +
-           ((uint64_t)old->cells + 1) * (sizeof(gsdi_tree) + sizeof(gsdi_need)) + old->trees * sizeof(uint32_t);
-}
-
-/* Most bytes held at once while refine makes `block` and `nodes` building nodes. What denoising takes is gone by then;
-   it is no more than a new part with as many building nodes as the old one. */
+/* Most bytes held at once while refine makes `block` and `nodes` building nodes. What denoising takes is gone by then,
+   but for the trees that the Gaussian one made; the other takes no more than a new part with as many building nodes as
+   the old one. */
 static uint64_t gsdi_refine_peak(const gsdi_refinement *r, const gsdi_block *block, uint64_t nodes)
 {
     const gsd_field *f = r->field;
-    uint64_t next = gsdi_bytes(block, nodes), blur = f->building_nodes * (uint64_t)GSDI_BLUR_FLOATS * sizeof(float);
-    return gsdi_bytes(f->block, f->node_capacity) + (f->state_capacity - f->block->cells) * sizeof(gsdi_state) +
-           (next > blur || r->denoise == GSD_DENOISE_OFF ? next : blur) +
-           gsdi_refine_scratch(f->block, f->building_nodes, r->place_capacity, r->spatial_capacity);
+    uint64_t next = gsdi_bytes(block, nodes) +
+                    gsdi_refine_scratch(f->block, f->building_nodes, r->place_capacity, r->spatial_capacity);
+    uint64_t blur = r->blur_bytes + gsdi_refine_scratch(f->block, f->building_nodes, 0, 0);
+    return gsdi_old_bytes(f) + r->made_bytes + (next > blur ? next : blur);
 }
 
 /* Whether this refine stays under max_bytes, and the next one can. It can where there is room for sampling trees as
@@ -2733,13 +3816,16 @@ static bool gsdi_refine_fits(const gsdi_refinement *r, uint64_t nodes)
            cap;
 }
 
-/* List the sampling trees of the new block: rebuilt ones, and old ones that some cell keeps. */
+/* List the sampling trees of the new block: rebuilt ones, and old ones that some cell keeps. May be called again. */
 static bool gsdi_list_trees(gsdi_refinement *r, gsdi_block *shape)
 {
     gsdi_block *old = r->field->block;
     const gsdi_tree *old_trees = gsdi_trees(old);
     const gsd_cell *old_cells = gsdi_cells(old);
     uint32_t c;
+    gsdi_release(r->desc, r->trees);
+    gsdi_release(r->desc, r->old_tree);
+    r->tree_count = 0;
     r->trees = (gsdi_tree *)gsdi_allocate(r->desc, (uint64_t)old->cells + 1, sizeof(gsdi_tree));
     r->old_tree = (uint32_t *)gsdi_allocate(r->desc, old->trees, sizeof(uint32_t));
     if (!r->trees || !r->old_tree)
@@ -2773,8 +3859,8 @@ static void gsdi_write_trees(void *context, uint32_t begin, uint32_t end)
         const gsdi_job *job = &r->jobs[c];
         uint32_t t = gsdi_cells(old)[c].tree;
         if (job->rebuild)
-            gsdi_tree_write(r->block, &r->trees[job->tree], r->field->child + s->first, r->mass + s->first,
-                            s->lit / job->limit_mass, 0.25 * (double)r->desc->smoothing);
+            gsdi_tree_write(r->block, &r->trees[job->tree], job->child, job->mass, s->lit / job->limit_mass,
+                            0.25 * (double)r->desc->smoothing);
         else if (job->copy)
             gsdi_tree_copy(r->block, &r->trees[job->tree], old, &gsdi_trees(old)[t]);
     }
@@ -2805,8 +3891,6 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
         const gsdi_place *p = &r->places[i];
         const gsdi_state *old = &r->field->states[p->source];
         const gsdi_job *job = &r->jobs[p->source];
-        const uint32_t *child = r->field->child + old->first;
-        const gsdi_sum *sum = r->field->sum + old->first;
         gsdi_state *s = &r->states[i];
         double total = 0, share, keep = 0;
         *s = *old;
@@ -2815,8 +3899,8 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
         s->level = p->level;
         memcpy(s->origin, p->origin, sizeof s->origin);
         if (!job->rebuild) {
-            memcpy(r->child + p->first, child, p->count * sizeof *child);
-            memcpy(r->sum + p->first, sum, p->count * sizeof *sum);
+            memcpy(r->child + p->first, job->child, p->count * sizeof *r->child);
+            memcpy(r->sum + p->first, job->sum, p->count * sizeof *r->sum);
         } else {
             for (k = 0; k < 64; ++k)
                 total += (double)old->bins[k];
@@ -2824,7 +3908,7 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
             share = p->level == old->level ? 1 : share;
             keep = r->keep * share;
             if (p->count > 1 || job->nodes == 1)
-                gsdi_refine_tree(child, sum, r->mass + old->first, r->rho * job->limit_mass, r->desc->max_depth, keep,
+                gsdi_refine_tree(job->child, job->sum, job->mass, r->rho * job->limit_mass, r->desc->max_depth, keep,
                                  r->child + p->first, r->sum + p->first);
             s->held = old->held * keep;
             s->lit = old->lit * keep;
@@ -2881,12 +3965,39 @@ static bool gsdi_refine_allocate(gsdi_refinement *r, uint32_t building_nodes)
     return r->block && r->states && r->child && r->sum;
 }
 
+/* The new cells and the sizes of their trees: the largest that stay under the memory cap, with the trees that denoising
+   left. Returns building nodes; *fits = they do. 0 = out of memory. */
+static uint64_t gsdi_refine_structure(gsdi_refinement *r, gsd_parallel_fn parallel, void *user, bool *fits)
+{
+    uint32_t old = r->old_cells;
+    uint64_t total;
+    r->shape = *r->field->block;
+    r->cell_limit = gsdi_cell_limit(r->desc);
+    if (!gsdi_list_trees(r, &r->shape))
+        return 0;
+    do {
+        if (!gsdi_split_cells(r))
+            return 0;
+        r->shape.cells = r->shape.cell_capacity = r->cells;
+        r->shape.spatial = r->spatial_count;
+        for (r->rho = (double)r->desc->rho;; r->rho *= r->rho < 0.9 ? 1.3 : 2) {
+            gsdi_run(parallel, user, old, 16, gsdi_count_nodes, r);
+            total = gsdi_place_nodes(r);
+            *fits = gsdi_refine_fits(r, total);
+            if (*fits || r->rho > 1) /* above 1 all trees are single leaves */
+                break;
+        }
+        r->cell_limit = old + (r->cells - old) / 2;
+    } while (!*fits && r->cells > old);
+    return total;
+}
+
 /* Structure decisions of refine: judged cells, splits, rho under the memory cap. Returns building nodes, 0 = out of
    memory. */
 static uint32_t gsdi_refine_plan(gsdi_refinement *r, gsd_parallel_fn parallel, void *user)
 {
     gsd_field *field = r->field;
-    uint32_t old = field->block->cells, i;
+    uint32_t old = r->old_cells, i;
     uint64_t total;
     bool fits;
     gsdi_step(r, "measure");
@@ -2903,28 +4014,18 @@ static uint32_t gsdi_refine_plan(gsdi_refinement *r, gsd_parallel_fn parallel, v
         r->stats.unread_cells += !(s->fresh > 0);
     }
     gsdi_step(r, "denoise");
-    if (!gsdi_denoise(r, parallel, user))
+    if ((r->denoise == GSD_DENOISE_BLUR && !gsdi_denoise(r, parallel, user)) ||
+        (r->denoise == GSD_DENOISE_GAUSSIAN && !gsdi_gauss_denoise(r, parallel, user)))
         return 0;
     gsdi_step(r, "split");
-    r->shape = *field->block;
-    r->cell_limit = gsdi_cell_limit(r->desc);
     r->needs = (gsdi_need *)gsdi_allocate(r->desc, (uint64_t)old + 1, sizeof *r->needs);
-    if (!r->needs || !gsdi_list_trees(r, &r->shape))
+    if (!r->needs)
         return 0;
-    do {
-        if (!gsdi_split_cells(r))
+    do { /* what the Gaussian denoiser made is larger than what the last refine left room for */
+        total = gsdi_refine_structure(r, parallel, user, &fits);
+        if (!total)
             return 0;
-        r->shape.cells = r->shape.cell_capacity = r->cells;
-        r->shape.spatial = r->spatial_count;
-        for (r->rho = (double)r->desc->rho;; r->rho *= r->rho < 0.9 ? 1.3 : 2) {
-            gsdi_run(parallel, user, old, 16, gsdi_count_nodes, r);
-            total = gsdi_place_nodes(r);
-            fits = gsdi_refine_fits(r, total);
-            if (fits || r->rho > 1) /* above 1 all trees are single leaves */
-                break;
-        }
-        r->cell_limit = old + (r->cells - old) / 2;
-    } while (!fits && r->cells > old);
+    } while (!fits && gsdi_gauss_give_back(r));
     r->stats.effective_rho = (float)r->rho;
     return total < 0xfffffff0u ? (uint32_t)total : 0;
 }
@@ -3020,11 +4121,13 @@ GSD_API gsd_result gsd_refine(gsd_field *field, const gsd_pass *pass, gsd_parall
     r.desc = &field->desc;
     r.pass = pass;
     r.denoise = pass && pass->denoise ? pass->denoise : r.desc->denoise;
-    if ((unsigned)r.denoise > GSD_DENOISE_BLUR)
+    if ((unsigned)r.denoise > GSD_DENOISE_GAUSSIAN)
         return GSD_BAD_OPTION;
+    r.old_cells = field->block->cells;
     r.stats = field->stats;
     r.stats.split_cells = r.stats.rebuilt_trees = r.stats.waiting_cells = r.stats.unread_cells = 0;
     r.stats.denoised_trees = r.stats.smooth_trees = r.stats.over_budget_trees = 0;
+    r.stats.shallow_trees = r.stats.deep_trees = 0;
     r.stats.mean_blur = 0;
     r.second_moment = field->target != GSD_TARGET_RADIANCE;
     for (i = 0; i < field->block->cells; ++i)
@@ -3070,9 +4173,13 @@ static gsd_simd gsdi_simd(gsd_simd wanted)
              __builtin_cpu_supports("avx512vl");
     if (wanted == GSD_SIMD_AUTO)
         return avx512 ? GSD_SIMD_AVX512 : avx2 ? GSD_SIMD_AVX2 : GSD_SIMD_SCALAR;
-    if ((wanted == GSD_SIMD_AVX2 && !avx2) || (wanted == GSD_SIMD_AVX512 && !avx512))
+    if ((wanted == GSD_SIMD_AVX2 && !avx2) || (wanted == GSD_SIMD_AVX512 && !avx512) || wanted == GSD_SIMD_NEON)
         return GSD_SIMD_AUTO;
     return wanted;
+#elif GSDI_NEON
+    if (wanted == GSD_SIMD_AUTO)
+        return GSD_SIMD_NEON;
+    return wanted == GSD_SIMD_NEON || wanted == GSD_SIMD_SCALAR ? wanted : GSD_SIMD_AUTO;
 #else
     return wanted == GSD_SIMD_AUTO || wanted == GSD_SIMD_SCALAR ? GSD_SIMD_SCALAR : GSD_SIMD_AUTO;
 #endif
@@ -3112,6 +4219,8 @@ GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
     gsdi_default_float(&d.denoise_budget, 0.25f);
     gsdi_default_float(&d.switch_after, 4);
     gsdi_default_float(&d.rho, 0.01f);
+    gsdi_default_float(&d.gaussian_sigma, 0.8f);
+    gsdi_default_float(&d.gaussian_rho, d.rho);
     gsdi_default_float(&d.smoothing, 3);
     gsdi_default_u32(&d.max_depth, 16);
     gsdi_default_u32(&d.max_levels, 48);
@@ -3124,13 +4233,14 @@ GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
     gsdi_default_u32(&d.gate_probe, 1);
     if ((unsigned)d.target > GSD_TARGET_SWITCHING || (unsigned)d.spatial_filter > GSD_SPATIAL_STOCHASTIC ||
         (unsigned)d.directional_filter > GSD_DIRECTIONAL_BOX || (unsigned)d.alpha_mode > GSD_ALPHA_GRID ||
-        (unsigned)d.denoise > GSD_DENOISE_BLUR || (unsigned)d.simd > GSD_SIMD_AVX512)
+        (unsigned)d.denoise > GSD_DENOISE_GAUSSIAN || (unsigned)d.simd > GSD_SIMD_NEON)
         return GSD_BAD_OPTION;
     d.simd = gsdi_simd(d.simd);
     if (d.simd == GSD_SIMD_AUTO)
         return GSD_BAD_OPTION;
     if (!gsdi_within((double)d.switch_after, 0.99e-3, 1e6) || !gsdi_within((double)d.smoothing, 0.99e-3, 1000) ||
-        !gsdi_within((double)d.denoise_budget, 0.99e-3, 1e6) ||
+        !gsdi_within((double)d.denoise_budget, 0.99e-3, 1e6) || !gsdi_within((double)d.gaussian_sigma, 0.099, 100) ||
+        !gsdi_within((double)d.gaussian_rho, 0.99e-5, 1) ||
         (d.split_samples != 0 && !gsdi_within((double)d.split_samples, 16, 1e9)) ||
         !gsdi_within((double)d.rho, 0.99e-5, 1) || !gsdi_within(d.max_depth, 1, 20) ||
         !gsdi_within(d.max_levels, 1, 60) || !gsdi_within((double)d.alpha, 0.0499, 1) ||
@@ -3971,6 +5081,10 @@ GSD_API void gsd_sample_batch(const gsd_view *view, uint32_t count, const uint32
     X(float, switch_after, float)                                                                                      \
     X(float, smoothing, float)                                                                                         \
     X(float, denoise_budget, float)                                                                                    \
+    X(float, gaussian_sigma, float)                                                                                    \
+    X(float, gaussian_rho, float)                                                                                      \
+    X(uint32_t, gaussian_sphere, bool)                                                                                 \
+    X(uint32_t, gaussian_no_limit, bool)                                                                               \
     X(uint32_t, max_depth, uint32_t)                                                                                   \
     X(uint32_t, max_levels, uint32_t)                                                                                  \
     X(uint32_t, min_samples, uint32_t)                                                                                 \

@@ -5,13 +5,14 @@
    A quadtree of depth 11 with about 3,000 leaves, grown where samples of a few lights fall, is flattened and blurred by
    a 7 x 7 Gaussian. 10 % of its elements are not copies (in the thesis, where masking gained 17x, 6 % at most). First
    runs the ladder of J. Nilsson's thesis (Chalmers University of Technology and University of
-   Gothenburg, Table 5.1: Core i7-3770K, mean of 100 runs), then the kernels of denoise_kernels.h. Every result is
+   Gothenburg, Table 5.1: Core i7-3770K, mean of 100 runs), then the kernels of guide_sdtree.h. Every result is
    compared with the double-precision reference of the tests before it is timed. The kernels take turns, so that all
    were measured on the machine in the same mood, and each finds the caches full of another's matrices. */
 #include "tests/denoise_naive.h"
 
 #include "bench.h"
-#include "denoise_kernels.h"
+#define GSD_IMPLEMENTATION
+#include "guide_sdtree.h"
 
 #define DEPTH 11u
 #define WIDTH (1u << DEPTH)
@@ -122,19 +123,36 @@ static dn_tree make_tree(uint32_t *leaves)
     return tree;
 }
 
+/* Child links from gsd_tree's form to that of the building part: node 0 the root, the children of inner node i of the
+   tree are 4 i + 1 .. 4 i + 4. */
+static uint32_t *building_form(const dn_tree *t)
+{
+    uint32_t *child = allocate(4 * (size_t)t->count + 1, sizeof *child);
+    child[0] = 1;
+    for (uint32_t k = 0; k < 4 * t->count; ++k)
+        child[k + 1] = t->child[k] ? 4 * t->child[k] + 1 : 0;
+    return child;
+}
+
 /* ---- what is measured --------------------------------------------------------------------------------------- */
 
 typedef struct data {
     dn_tree tree;
-    float *plain;  /* WIDTH x WIDTH */
-    float *thesis; /* PADDED x PADDED and eight more, zeros around */
-    float *own;    /* element (0, 0) of the matrix of denoise_kernels.h */
-    float *out;    /* WIDTH x WIDTH */
+    uint32_t *building; /* the tree as refine has it: first of four children, 0 = leaf */
+    float *plain;       /* WIDTH x WIDTH */
+    float *thesis;      /* PADDED x PADDED and eight more, zeros around */
+    float *own;         /* element (0, 0) of a matrix of guide_sdtree.h */
+    float *out;         /* WIDTH x WIDTH */
     unsigned char *mask;
     float kernel[7][7], w[4];
     uint64_t *map;
-    blur_run *run;
+    gsdi_gauss_run *run;
     size_t runs;
+    gsdi_gauss_slot slot; /* to blur the whole tree in */
+    gsdi_sum *sum;
+    double *mass;
+    unsigned char *height;
+    gsd_simd simd;
 } data;
 
 typedef void (*kernel_fn)(data *d);
@@ -246,26 +264,57 @@ static void run_copy(data *d)
 #endif
 }
 
-static void run_pad(data *d) { blur_pad(d->own, blur_stride(WIDTH), WIDTH, true); }
+static void run_pad(data *d) { gsdi_gauss_pad(d->own, gsdi_gauss_stride(WIDTH), WIDTH, true); }
 static void run_runs(data *d)
 {
-    blur_map(d->tree.child, DEPTH, d->map);
-    d->runs = blur_runs(d->map, WIDTH, 0, WIDTH / BLUR_ROWS, d->run);
+    gsdi_gauss_map(d->building, DEPTH, d->map);
+    d->runs = gsdi_gauss_runs(d->map, WIDTH, 0, WIDTH / GSDI_GAUSS_ROWS, d->run);
 }
-static void run_full(data *d) { blur_full(d->own, blur_stride(WIDTH), d->out, WIDTH, WIDTH, 0, WIDTH, d->w); }
-static void run_packed(data *d) { blur_packed(d->own, blur_stride(WIDTH), d->out, d->run, d->runs, d->w); }
-#if BLUR_X86
-static void run_full_avx2(data *d) { blur_full_avx2(d->own, blur_stride(WIDTH), d->out, WIDTH, WIDTH, 0, WIDTH, d->w); }
+static void run_full(data *d)
+{
+    gsdi_gauss_full_scalar(d->own, gsdi_gauss_stride(WIDTH), d->out, WIDTH, WIDTH, 0, WIDTH, d->w);
+}
+static void run_packed(data *d)
+{
+    gsdi_gauss_packed_scalar(d->own, gsdi_gauss_stride(WIDTH), d->out, d->run, d->runs, d->w);
+}
+#if GSDI_X86
+static void run_full_avx2(data *d)
+{
+    gsdi_gauss_full_avx2(d->own, gsdi_gauss_stride(WIDTH), d->out, WIDTH, WIDTH, 0, WIDTH, d->w);
+}
 static void run_full_avx512(data *d)
 {
-    blur_full_avx512(d->own, blur_stride(WIDTH), d->out, WIDTH, WIDTH, 0, WIDTH, d->w);
+    gsdi_gauss_full_avx512(d->own, gsdi_gauss_stride(WIDTH), d->out, WIDTH, WIDTH, 0, WIDTH, d->w);
 }
-static void run_packed_avx2(data *d) { blur_packed_avx2(d->own, blur_stride(WIDTH), d->out, d->run, d->runs, d->w); }
+static void run_packed_avx2(data *d)
+{
+    gsdi_gauss_packed_avx2(d->own, gsdi_gauss_stride(WIDTH), d->out, d->run, d->runs, d->w);
+}
 static void run_packed_avx512(data *d)
 {
-    blur_packed_avx512(d->own, blur_stride(WIDTH), d->out, d->run, d->runs, d->w);
+    gsdi_gauss_packed_avx512(d->own, gsdi_gauss_stride(WIDTH), d->out, d->run, d->runs, d->w);
 }
 #endif
+
+#if GSDI_NEON
+static void run_full_neon(data *d)
+{
+    gsdi_gauss_full_neon(d->own, gsdi_gauss_stride(WIDTH), d->out, WIDTH, WIDTH, 0, WIDTH, d->w);
+}
+static void run_packed_neon(data *d)
+{
+    gsdi_gauss_packed_neon(d->own, gsdi_gauss_stride(WIDTH), d->out, d->run, d->runs, d->w);
+}
+#endif
+
+/* All of it for one tree: layers 6 .. 11, merged, and the nodes of the new tree counted. */
+static void run_tree(data *d)
+{
+    gsdi_gauss_blur(&d->slot, d->building, d->mass, d->height, d->simd, false, d->w);
+    if (gsdi_gauss_rebuild(&d->slot, 0.01, d->building, d->sum, NULL, NULL, NULL) < 5)
+        fail("the blurred tree is empty");
+}
 
 typedef enum check { CHECK_NONE, CHECK_THESIS, CHECK_OWN, CHECK_PACKED } check;
 
@@ -303,8 +352,8 @@ static double largest_error(const data *d, const double *truth, bool packed)
     double largest = 0;
     for (size_t row = 0; row < WIDTH; ++row)
         for (size_t column = 0; column < WIDTH; ++column) {
-            size_t at = row * WIDTH + column, block = column / BLUR_COLUMNS;
-            uint64_t word = d->map[row / BLUR_ROWS * blur_map_stride(WIDTH) + block / 64];
+            size_t at = row * WIDTH + column, block = column / GSDI_GAUSS_COLUMNS;
+            uint64_t word = d->map[row / GSDI_GAUSS_ROWS * gsdi_gauss_map_stride(WIDTH) + block / 64];
             bool active = !packed || (word >> (block % 64) & 1);
             double value = active ? (double)d->out[at] : (double)d->plain[at];
             double error = fabs(value - truth[at]) / (truth[at] > 0 ? truth[at] : 1);
@@ -324,11 +373,11 @@ static void unpack(data *d)
     for (size_t i = 0; i < elements; ++i)
         d->out[i] = -1;
     for (size_t i = 0; i < d->runs; ++i)
-        for (size_t b = d->run[i].first; b < d->run[i].end; ++b, from += BLUR_BLOCK, ++count)
-            for (size_t r = 0; r < BLUR_ROWS; ++r)
-                memcpy(d->out + (d->run[i].row * BLUR_ROWS + r) * WIDTH + b * BLUR_COLUMNS, from + r * BLUR_COLUMNS,
-                       BLUR_COLUMNS * sizeof(float));
-    for (size_t i = count * BLUR_BLOCK; i < elements; ++i)
+        for (size_t b = d->run[i].first; b < d->run[i].end; ++b, from += GSDI_GAUSS_BLOCK, ++count)
+            for (size_t r = 0; r < GSDI_GAUSS_ROWS; ++r)
+                memcpy(d->out + (d->run[i].row * GSDI_GAUSS_ROWS + r) * WIDTH + b * GSDI_GAUSS_COLUMNS,
+                       from + r * GSDI_GAUSS_COLUMNS, GSDI_GAUSS_COLUMNS * sizeof(float));
+    for (size_t i = count * GSDI_GAUSS_BLOCK; i < elements; ++i)
         if (!(packed[i] < 0))
             fail("a packed kernel wrote beyond its blocks");
     free(packed);
@@ -339,7 +388,7 @@ static void validate(data *d, const kernel *k, const dn_matrix *zero, const dn_m
     for (int border = DN_ZERO; border <= DN_SPHERE; ++border) {
         if (k->check == CHECK_NONE || (k->check == CHECK_THESIS && border == DN_SPHERE))
             continue;
-        blur_pad(d->own, blur_stride(WIDTH), WIDTH, border == DN_SPHERE);
+        gsdi_gauss_pad(d->own, gsdi_gauss_stride(WIDTH), WIDTH, border == DN_SPHERE);
         for (size_t i = 0; i < (size_t)WIDTH * WIDTH; ++i)
             d->out[i] = -1;
         k->run(d);
@@ -362,19 +411,20 @@ static data make_data(double sigma)
     size_t elements = (size_t)WIDTH * WIDTH, active = 0, blocks = 0, zero = 0;
     memset(&d, 0, sizeof d);
     d.tree = make_tree(&leaves);
+    d.building = building_form(&d.tree);
     if (dn_depth(&d.tree, 0) != DEPTH)
         fail("the tree has another depth");
     dn_matrix m = dn_flatten(&d.tree, DEPTH);
     d.plain = allocate(elements, sizeof(float));
     d.out = allocate(elements, sizeof(float));
     d.thesis = allocate((size_t)PADDED * PADDED + 8, sizeof(float));
-    d.own = (float *)allocate(blur_floats(WIDTH), sizeof(float)) + blur_origin(WIDTH);
+    d.own = (float *)allocate(gsdi_gauss_floats(WIDTH), sizeof(float)) + gsdi_gauss_origin(WIDTH);
     for (size_t row = 0; row < WIDTH; ++row)
         for (size_t column = 0; column < WIDTH; ++column) {
             float value = (float)m.v[row * WIDTH + column];
             d.plain[row * WIDTH + column] = value;
             d.thesis[(row + MARGIN) * PADDED + column + MARGIN] = value;
-            d.own[row * blur_stride(WIDTH) + column] = value;
+            d.own[row * gsdi_gauss_stride(WIDTH) + column] = value;
             zero += !(value > 0);
         }
     dn_free_matrix(&m);
@@ -386,9 +436,9 @@ static data make_data(double sigma)
     for (int i = 0; i < 7; ++i)
         for (int j = 0; j < 7; ++j)
             d.kernel[i][j] = (float)(weight[i] * weight[j]);
-    blur_weights(sigma, d.w);
-    d.map = allocate(blur_map_words(WIDTH), sizeof *d.map);
-    d.run = allocate((size_t)WIDTH / BLUR_ROWS * (WIDTH / 8), sizeof *d.run);
+    gsdi_gauss_weights(sigma, d.w);
+    d.map = allocate(gsdi_gauss_map_words(WIDTH), sizeof *d.map);
+    d.run = allocate((size_t)WIDTH / GSDI_GAUSS_ROWS * (WIDTH / 8), sizeof *d.run);
     run_runs(&d);
     for (size_t i = 0; i < d.runs; ++i)
         blocks += (size_t)(d.run[i].end - d.run[i].first);
@@ -396,9 +446,28 @@ static data make_data(double sigma)
         "tree: depth %u, %u leaves; sigma %.2f; %.1f %% of the elements are not copies, %.1f %% of the blocks of %u x "
         "%u, in %zu runs; %.1f %% are 0\n",
         DEPTH, leaves, sigma, 100 * (double)active / (double)elements,
-        100 * (double)(blocks * BLUR_BLOCK) / (double)elements, BLUR_ROWS, BLUR_COLUMNS, d.runs,
+        100 * (double)(blocks * GSDI_GAUSS_BLOCK) / (double)elements, GSDI_GAUSS_ROWS, GSDI_GAUSS_COLUMNS, d.runs,
         100 * (double)zero / (double)elements);
     return d;
+}
+
+static void make_slot(data *d)
+{
+    uint32_t count = 4 * d->tree.count + 1;
+    unsigned char *depth = allocate(count, 1);
+    uint64_t bytes[5];
+    d->sum = allocate(count, sizeof *d->sum);
+    d->mass = allocate(count, sizeof *d->mass);
+    d->height = allocate(count, 1);
+    for (uint32_t k = 0; k + 1 < count; ++k)
+        d->sum[k + 1].half[0] = d->tree.child[k] ? 0 : d->tree.value[k];
+    gsdi_tree_masses(d->building, d->sum, count, false, d->mass, depth);
+    gsdi_gauss_heights(d->building, count, d->height);
+    d->slot.depth = DEPTH;
+    d->slot.memory = allocate(1, (size_t)gsdi_gauss_parts(DEPTH, bytes));
+    gsdi_gauss_slot_cut(&d->slot, DEPTH);
+    d->simd = gsdi_simd(GSD_SIMD_AUTO);
+    free(depth);
 }
 
 static void list_kernels(bool quick)
@@ -421,21 +490,28 @@ static void list_kernels(bool quick)
     }
 #endif
     add("separable, scalar", run_full, CHECK_OWN, medium, 0, 0);
-#if BLUR_X86
+#if GSDI_X86
     if (avx2)
         add("separable, AVX2", run_full_avx2, CHECK_OWN, fast, 3, 0);
     if (avx512)
         add("separable, AVX-512", run_full_avx512, CHECK_OWN, fast, 1.5, 0);
 #endif
+#if GSDI_NEON
+    add("separable, NEON", run_full_neon, CHECK_OWN, fast, 0, 0);
+#endif
     add("separable, masked, scalar", run_packed, CHECK_PACKED, medium, 0, 0);
-#if BLUR_X86
+#if GSDI_X86
     if (avx2)
         add("separable, masked, AVX2", run_packed_avx2, CHECK_PACKED, fast, 0.5, 0);
     if (avx512)
         add("separable, masked, AVX-512", run_packed_avx512, CHECK_PACKED, fast, 0.5, 0);
 #endif
+#if GSDI_NEON
+    add("separable, masked, NEON", run_packed_neon, CHECK_PACKED, fast, 0, 0);
+#endif
     add("fill the margins", run_pad, CHECK_NONE, fast, 0, 0);
     add("list the runs of blocks", run_runs, CHECK_NONE, fast, 0, 0);
+    add("a whole tree, best level", run_tree, CHECK_NONE, medium, 0, 0);
     (void)avx2;
     (void)avx512;
 }
@@ -486,6 +562,7 @@ int main(int argc, char **argv)
         fail("--sigma wants 0.3 .. 100");
     bench_print_machine(json);
     data d = make_data(sigma);
+    make_slot(&d);
     dn_matrix m = dn_flatten(&d.tree, DEPTH);
     dn_matrix zero = dn_blur(&m, sigma, DN_ZERO, NULL), sphere = dn_blur(&m, sigma, DN_SPHERE, NULL);
     list_kernels(quick);
@@ -508,9 +585,14 @@ int main(int argc, char **argv)
         fclose(json);
     }
     dn_free_tree(&d.tree);
+    free(d.building);
+    free(d.slot.memory);
+    free(d.sum);
+    free(d.mass);
+    free(d.height);
     free(d.plain);
     free(d.thesis);
-    free(d.own - blur_origin(WIDTH));
+    free(d.own - gsdi_gauss_origin(WIDTH));
     free(d.out);
     free(d.mask);
     free(d.map);

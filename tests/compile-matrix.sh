@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The headers as users compile them: each guide_*.h alone, declarations and implementation, as C99, C11, C++11 and C++17,
 # by gcc and clang, without a warning; the example in its opening comment compiled and run as it stands; the compile
-# lines of examples/*.c as they stand; nothing but prefixed symbols and macros. Speaks TAP.
+# lines of examples/*.c as they stand; nothing but prefixed symbols and macros; NEON code in an emulator. Speaks TAP.
 export LC_ALL=C
 cd "$(dirname "$0")/.." || exit 1
 tmp=$(mktemp -d) || exit 1
@@ -139,6 +139,16 @@ for header in $headers; do
 done >"$tmp/all.c"
 echo 'int main(void) { return 0; }' >>"$tmp/all.c"
 attempt "all headers in one file" ${compiler:-cc} -std=c99 $warn -I. "$tmp/all.c" -lm -o "$tmp/a.out"
+
+# NEON's blur in an emulator, where there is one; on AArch64 itself test_sdtree_denoise runs it.
+name="guide_sdtree.h: NEON blur agrees with double precision (AArch64, emulated)"
+if command -v aarch64-linux-gnu-gcc >/dev/null && command -v qemu-aarch64 >/dev/null; then
+    aarch64-linux-gnu-gcc -std=c99 -O2 $warn -static -I. tests/blur_levels.c -lm -o "$tmp/blur_levels" >"$tmp/log" 2>&1 &&
+        qemu-aarch64 "$tmp/blur_levels" >"$tmp/log" 2>&1 && grep -q NEON "$tmp/log"
+    report $? "$name"
+else
+    skip "$name (no cross compiler or no qemu-aarch64)"
+fi
 
 # The compile lines on top of the examples, run as they stand in a copy of the tree's root.
 mkdir -p "$tmp/root/examples/tracer"

@@ -171,7 +171,7 @@ static void check_single(stress *s, const gsd_view *v, query *q)
 /* Every SIMD level of this machine against single queries; rounding may choose the neighbour once. */
 static void check_batches(stress *s, const gsd_view *v, const query *q)
 {
-    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_AVX512; ++level) {
+    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_NEON; ++level) {
         static float out[BATCH][4], pdf[BATCH], again[BATCH];
         gsd_view at = *v;
         int apart = 0, other = 0;
@@ -293,7 +293,11 @@ static gsd_desc any_desc(stress *s)
     d.switch_after = stress_chance(s, 0.5) ? 0 : (float)stress_log(s, 0.001, 10);
     d.uniform = stress_chance(s, 0.7) ? 0 : (float)stress_log(s, 1e-4, 1);
     d.smoothing = stress_chance(s, 0.7) ? 0 : (float)stress_log(s, 0.001, 1000);
-    d.denoise = (gsd_denoise_mode)stress_below(s, 3);
+    d.denoise = (gsd_denoise_mode)stress_below(s, 4);
+    d.gaussian_sigma = stress_chance(s, 0.5) ? 0 : (float)stress_log(s, 0.1, 100);
+    d.gaussian_rho = stress_chance(s, 0.5) ? 0 : (float)stress_log(s, 1e-5, 1);
+    d.gaussian_sphere = stress_chance(s, 0.5);
+    d.gaussian_no_limit = stress_chance(s, 0.2);
     d.denoise_budget = stress_chance(s, 0.7) ? 0 : (float)stress_log(s, 0.001, 1e6);
     d.alpha = stress_chance(s, 0.7) ? 0 : 0.05f + 0.95f * stress_unitf(s);
     d.max_bytes = (uint64_t)1 << (20 + stress_below(s, 6));
@@ -440,7 +444,7 @@ static gsd_result record(stress *s, gsd_stream *stream, const gsd_field *f, uint
 /* One pass over a batch of n samples; without memory trouble nothing may fail. */
 static void learn(stress *s, gsd_field *f, gsd_stream *stream, uint32_t n)
 {
-    gsd_pass pass = {.pixel_estimate = stress_chance(s, 0.5), .denoise = (gsd_denoise_mode)stress_below(s, 3)};
+    gsd_pass pass = {.pixel_estimate = stress_chance(s, 0.5), .denoise = (gsd_denoise_mode)stress_below(s, 4)};
     STRESS_CHECK(s, record(s, stream, f, n) == GSD_OK, "record");
     STRESS_CHECK(s, gsd_accumulate(f, &stream, 1, NULL, NULL) == GSD_OK, "accumulate");
     gsd_stream_clear(stream);
@@ -608,6 +612,8 @@ static const limit limits[] = {
     LIMIT(uniform, false, 1e-4, 1),
     LIMIT(smoothing, false, 1e-3, 1000),
     LIMIT(denoise_budget, false, 1e-3, 1e6),
+    LIMIT(gaussian_sigma, false, 0.1, 100),
+    LIMIT(gaussian_rho, false, 1e-5, 1),
     LIMIT(gate_margin, false, 0.001, 10),
     LIMIT(gate_gain, false, 1e-4, 1000),
     LIMIT(gate_probe, true, 1, 1000),
@@ -1265,6 +1271,142 @@ static void queries(stress *s)
     stress_survived(s);
 }
 
+/* ---- group: denoising of hostile building trees */
+
+/* Give the field's first `count` cells these trees as building trees, as if samples had made them. */
+static void plant_trees(stress *s, gsd_field *f, const gsd_tree *trees, uint32_t count)
+{
+    uint32_t nodes = f->building_nodes, all = nodes;
+    for (uint32_t c = 0; c < count; ++c)
+        all += 4 * trees[c].count + 1;
+    uint32_t *child = f->desc.allocate(f->desc.user, all * sizeof *child);
+    gsdi_sum *sum = f->desc.allocate(f->desc.user, all * sizeof *sum);
+    memcpy(child, f->child, nodes * sizeof *child);
+    memcpy(sum, f->sum, nodes * sizeof *sum);
+    for (uint32_t c = 0; c < count; ++c) { /* children of inner node i are 4 i + 1 .. 4 i + 4 */
+        const gsd_tree *t = &trees[c];
+        gsdi_state *state = &f->states[c];
+        double share = stress_chance(s, 0.2) ? 0 : stress_unit(s);
+        state->first = nodes;
+        state->count = 4 * t->count + 1;
+        state->held = state->fresh = state->lit = stress_log(s, 1, 1e9);
+        child[nodes] = 1;
+        memset(&sum[nodes++], 0, sizeof *sum);
+        for (uint32_t k = 0; k < 4 * t->count; ++k, ++nodes) {
+            child[nodes] = t->child[k] ? 4 * t->child[k] + 1 : 0;
+            sum[nodes].half[0] = t->child[k] ? 0 : share * (double)t->value[k];
+            sum[nodes].half[1] = t->child[k] ? 0 : (1 - share) * (double)t->value[k];
+        }
+    }
+    f->desc.release(f->desc.user, f->child);
+    f->desc.release(f->desc.user, f->sum);
+    f->child = child;
+    f->sum = sum;
+    f->building_nodes = f->node_capacity = nodes;
+    gsdi_field_changed(f);
+}
+
+/* Any tree, often with extreme values: one hot leaf, all alike, all zero. */
+static gsd_tree hostile_tree(stress *s, uint32_t cell, uint32_t max_depth)
+{
+    gsd_tree t = any_tree(s, cell, some(s, 1500), max_depth);
+    uint32_t kind = stress_below(s, 6), hot = stress_below(s, 4 * t.count);
+    for (uint32_t k = 0; kind < 3 && k < 4 * t.count; ++k)
+        t.value[k] = kind == 0 ? (k == hot ? 9e29f : 0) : kind == 1 ? 1 : 0;
+    return t;
+}
+
+/* Every rebuilt tree is accounted for, and shares are shares. */
+static void check_denoised(stress *s, const gsd_field *f, uint32_t cells)
+{
+    gsd_stats stats;
+    gsd_get_stats(f, &stats);
+    if (s->sabotage && stress_chance(s, 0.2))
+        s->deviating = true, stats.denoised_trees++;
+    STRESS_CHECK(
+        s,
+        stats.denoised_trees + stats.smooth_trees + stats.shallow_trees + stats.deep_trees + stats.over_budget_trees ==
+            stats.rebuilt_trees,
+        "%u rebuilt, %u denoised, %u smooth, %u shallow, %u deep, %u over budget", stats.rebuilt_trees,
+        stats.denoised_trees, stats.smooth_trees, stats.shallow_trees, stats.deep_trees, stats.over_budget_trees);
+    for (uint32_t c = 0; c < cells && !s->failed; ++c) {
+        gsd_tree t = {c, gsd_export_bound(f, GSD_PART_SAMPLING, c), NULL, NULL};
+        double sum = 0;
+        bool good = true;
+        t.child = calloc(4 * (size_t)t.count, sizeof *t.child);
+        t.value = calloc(4 * (size_t)t.count, sizeof *t.value);
+        STRESS_CHECK(s, gsd_export_tree(f, GSD_PART_SAMPLING, &t) == GSD_OK, "export");
+        for (uint32_t k = 0; k < 4 * t.count; ++k) {
+            good = good && t.value[k] >= 0;
+            sum += t.child[k] ? 0 : (double)t.value[k];
+        }
+        STRESS_CHECK(s, good && fabs(sum - 1) < 1e-4, "cell %u: shares sum to %g%s", c, sum, good ? "" : ", some < 0");
+        free_tree(&t);
+    }
+}
+
+/* Learned masses of all coarse bins: levels of SIMD may not differ there. */
+static void check_levels(stress *s, const gsd_field *a, const gsd_field *b)
+{
+    gsd_view v = gsd_get_view(a), w = gsd_get_view(b);
+    STRESS_CHECK(s, a->block->jumps == b->block->jumps, "other trees at another SIMD level");
+    for (uint32_t k = 0; k < a->block->jumps && !s->failed; ++k)
+        STRESS_CHECK(s, fabsf(v.masses[k] - w.masses[k]) <= 1e-4f, "bin %u: mass %g at one SIMD level, %g at another",
+                     k, (double)v.masses[k], (double)w.masses[k]);
+}
+
+/* A copy of a saved field, refined in one mode. */
+static gsd_field *denoised_copy(stress *s, const unsigned char *data, size_t size, gsd_simd simd, gsd_denoise_mode mode)
+{
+    gsd_desc given;
+    gsd_pass pass = {.pixel_estimate = false, .denoise = mode};
+    gsd_field *f = NULL;
+    memset(&given, 0, sizeof given);
+    given.simd = simd;
+    if (STRESS_CHECK(s, gsd_load(&given, data, size, &f) == GSD_OK, "load"))
+        STRESS_CHECK(s, gsd_refine(f, &pass, NULL, NULL) == GSD_OK, "refine");
+    return f;
+}
+
+static void denoise(stress *s)
+{
+    enum { TREES = 3 };
+    gsd_desc d = any_desc(s);
+    gsd_field *f, *blurred, *gaussian = NULL, *scalar = NULL;
+    gsd_stream *stream;
+    gsd_tree trees[TREES];
+    unsigned char *data;
+    size_t size;
+    d.forest_cells = TREES;
+    d.max_depth = 6 + stress_below(s, 15);
+    d.max_bytes = stress_chance(s, 0.2) ? d.max_bytes : 1u << 30;
+    f = new_field(s, &d, &stream);
+    for (uint32_t c = 0; c < TREES; ++c)
+        trees[c] = hostile_tree(s, c, d.max_depth);
+    plant_trees(s, f, trees, TREES);
+    data = save_of(s, f, &size);
+    blurred = denoised_copy(s, data, size, GSD_SIMD_AUTO, GSD_DENOISE_BLUR);
+    if (!s->failed)
+        gaussian = denoised_copy(s, data, size, GSD_SIMD_AUTO, GSD_DENOISE_GAUSSIAN);
+    if (!s->failed)
+        scalar = denoised_copy(s, data, size, GSD_SIMD_SCALAR, GSD_DENOISE_GAUSSIAN);
+    if (!s->failed) {
+        check_denoised(s, blurred, TREES);
+        check_denoised(s, gaussian, TREES);
+        check_levels(s, gaussian, scalar);
+        check_field(s, blurred);
+        check_field(s, gaussian);
+    }
+    for (uint32_t c = 0; c < TREES; ++c)
+        free_tree(&trees[c]);
+    free(data);
+    gsd_destroy(blurred);
+    gsd_destroy(gaussian);
+    gsd_destroy(scalar);
+    end_field(f, stream);
+    stress_survived(s);
+}
+
 /* The same samples, cut at other places into streams and calls, by other numbers of threads. */
 static void learn_cut(stress *s, gsd_field *f, uint32_t n, uint32_t cuts, stress_crowd *crowd)
 {
@@ -1340,6 +1482,7 @@ int main(int argc, char **argv)
         {"forged-saves", forged_saves, 3, true},
         {"imported-trees", imported_trees, 2, true},
         {"queries", queries, 2, false},
+        {"denoise", denoise, 2, false},
         {"threads", threads, 2, false},
     };
     return stress_main(argc, argv, "sdtree", groups, (int)(sizeof groups / sizeof *groups));

@@ -195,6 +195,7 @@ static void test_documented_defaults_are_the_defaults(void **state)
                   {"split_samples", (double)d.split_samples},
                   {"rho", (double)d.rho},
                   {"smoothing", (double)d.smoothing},
+                  {"gaussian_sigma", (double)d.gaussian_sigma},
                   {"max_depth", d.max_depth},
                   {"max_levels", d.max_levels},
                   {"min_samples", d.min_samples},
@@ -306,7 +307,7 @@ static void test_sizes_are_as_documented(void **state)
     assert_int_equal(sizeof(gsd_training_sample), 44);
     assert_int_equal(sizeof(gsdi_tree), 32);
     assert_true(sizeof(gsdi_state) < 600);
-    assert_int_equal(sizeof(gsd_stats), 15 * 8 + 20 * 4);
+    assert_int_equal(sizeof(gsd_stats), 15 * 8 + 22 * 4);
     assert_int_equal(sizeof(gsdi_sum) + sizeof(uint32_t), 20);
     /* bytes of a field: 16 a node in the sampling part, 20 in the building part */
     gsd_field *few = forest_of(1, 40, 16, false, GSD_SIMD_AUTO), *many = forest_of(1, 1040, 16, false, GSD_SIMD_AUTO);
@@ -951,7 +952,7 @@ static bool have_level(int level)
 static void test_oriented_samples_at_edges_of_bins(void **state)
 {
     (void)state;
-    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_AVX512; ++level) {
+    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_NEON; ++level) {
         if (!have_level(level))
             continue;
         gsd_field *f = oriented_forest(0, 4, (gsd_desc){.simd = (gsd_simd)level});
@@ -1006,7 +1007,7 @@ static void test_odd_normals_do_no_harm(void **state)
     const float long_normals[][3] = {{2, 0, 0},          {0, -1e5f, 1e5f}, {1e18f, 0, 0},
                                      {1e30f, -1e30f, 0}, {0, 0, 3e38f},    {3e38f, 3e38f, 3e38f}};
     enum { PLAIN = sizeof plain_normals / sizeof *plain_normals, LONG = sizeof long_normals / sizeof *long_normals };
-    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_AVX512; ++level)
+    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_NEON; ++level)
         for (unsigned kind = 0; have_level(level) && kind < TREE_KINDS; kind += 2) {
             gsd_field *f = oriented_forest(kind, 1, (gsd_desc){.simd = (gsd_simd)level, .alias = kind % 4 == 0});
             gsd_view v = gsd_get_view(f);
@@ -1126,7 +1127,7 @@ static void test_normals_survive_packing(void **state)
 static void test_batches_equal_single_queries_at_every_level(void **state)
 {
     (void)state;
-    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_AVX512; ++level)
+    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_NEON; ++level)
         for (int alias = 0; alias < 2; ++alias) {
             enum { N = 1003 };
             gsd_desc probe = unit_cube(GSD_TARGET_RADIANCE), resolved;
@@ -1174,7 +1175,7 @@ static void test_batches_equal_single_queries_at_every_level(void **state)
 static void test_batches_of_oriented_handles_equal_single_queries(void **state)
 {
     (void)state;
-    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_AVX512; ++level)
+    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_NEON; ++level)
         for (int alias = 0; have_level(level) && alias < 2; ++alias) {
             enum { N = 5003, CELLS = 40 };
             gsd_tree trees[CELLS];
@@ -1827,7 +1828,7 @@ static void test_split_threshold_follows_the_samples(void **state)
 static void test_find_with_normals_equals_its_batch(void **state)
 {
     (void)state;
-    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_AVX512; ++level) {
+    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_NEON; ++level) {
         enum { N = 2003 };
         if (!have_level(level))
             continue;

@@ -351,7 +351,19 @@ static void test_denoising_pays(void **state)
     }
 }
 
-/* 5 passes of n samples each in a box, light of two kinds. */
+/* n samples in a box, light of two kinds. */
+static void record_box(gsd_stream *s, int n)
+{
+    for (int i = 0; i < n; ++i) {
+        float at[3] = {(float)rnd(), (float)rnd(), (float)rnd()}, w[3];
+        gsd_direction(rnd() * 16777216, rnd() * 16777216, w);
+        float L = (float)(light(i % 2, w) * rnd());
+        gsd_training_sample sample = gsd_make_scalar_sample(at, w, NULL, L, L, L, GSD_INV_4PI, GSD_INV_4PI, 0);
+        OK(gsd_record(s, &sample, 1));
+    }
+}
+
+/* 5 passes of n of them each. */
 static void learn_box(const gsd_desc *options, int n, gsd_parallel_fn parallel, crowd *user, gsd_field **field)
 {
     gsd_desc d = *options;
@@ -362,13 +374,7 @@ static void learn_box(const gsd_desc *options, int n, gsd_parallel_fn parallel, 
     OK(gsd_stream_create(f, &s));
     rng_state = 5;
     for (int pass = 0; pass < 5; ++pass) {
-        for (int i = 0; i < n; ++i) {
-            float at[3] = {(float)rnd(), (float)rnd(), (float)rnd()}, w[3];
-            gsd_direction(rnd() * 16777216, rnd() * 16777216, w);
-            float L = (float)(light(i % 2, w) * rnd());
-            gsd_training_sample sample = gsd_make_scalar_sample(at, w, NULL, L, L, L, GSD_INV_4PI, GSD_INV_4PI, 0);
-            OK(gsd_record(s, &sample, 1));
-        }
+        record_box(s, n);
         OK(gsd_accumulate(f, &s, 1, parallel, user));
         gsd_stream_clear(s);
         OK(gsd_refine(f, NULL, parallel, user));
@@ -377,17 +383,21 @@ static void learn_box(const gsd_desc *options, int n, gsd_parallel_fn parallel, 
     *field = f;
 }
 
-static size_t saved_box(gsd_parallel_fn parallel, crowd *user, unsigned char **data)
+static size_t saved_box(gsd_denoise_mode mode, gsd_parallel_fn parallel, crowd *user, unsigned char **data)
 {
     gsd_desc d;
     gsd_field *f;
     gsd_stats stats;
     memset(&d, 0, sizeof d);
+    d.denoise = mode;
+    d.rho = mode == GSD_DENOISE_GAUSSIAN ? 0.001f : 0;
     learn_box(&d, 6000, parallel, user, &f);
     gsd_get_stats(f, &stats);
-    assert_true(stats.cells > 20 && stats.denoised_trees > stats.cells / 4 && stats.mean_blur > 0.02f);
+    assert_true(stats.cells > 20 && stats.denoised_trees > stats.cells / 4);
+    assert_true(mode == GSD_DENOISE_BLUR ? stats.mean_blur > 0.02f : stats.mean_blur == 0);
     assert_true(stats.over_budget_trees == 0);
-    assert_int_equal(stats.denoised_trees + stats.smooth_trees, stats.rebuilt_trees);
+    assert_int_equal(stats.denoised_trees + stats.smooth_trees + stats.shallow_trees + stats.deep_trees,
+                     stats.rebuilt_trees);
     size_t size = gsd_save_bound(f);
     *data = malloc(size);
     OK(gsd_save(f, *data, size, &size));
@@ -398,15 +408,17 @@ static size_t saved_box(gsd_parallel_fn parallel, crowd *user, unsigned char **d
 static void test_any_threads_give_the_same_field(void **state)
 {
     (void)state;
-    unsigned char *serial, *other;
-    size_t size = saved_box(NULL, NULL, &serial);
-    for (int threads = 1; threads <= 4; ++threads) {
-        crowd team = {threads, (uint32_t)(5 - threads)};
-        assert_int_equal(saved_box(crowd_for, &team, &other), size);
-        assert_memory_equal(serial, other, size);
-        free(other);
+    for (int mode = GSD_DENOISE_BLUR; mode <= GSD_DENOISE_GAUSSIAN; ++mode) {
+        unsigned char *serial, *other;
+        size_t size = saved_box((gsd_denoise_mode)mode, NULL, NULL, &serial);
+        for (int threads = 1; threads <= 4; ++threads) {
+            crowd team = {threads, (uint32_t)(5 - threads)};
+            assert_int_equal(saved_box((gsd_denoise_mode)mode, crowd_for, &team, &other), size);
+            assert_memory_equal(serial, other, size);
+            free(other);
+        }
+        free(serial);
     }
-    free(serial);
 }
 
 /* Depths of the building tree's leaves at the middles of 64 x 64 squares; the field has one cell. */
@@ -548,6 +560,591 @@ static void test_pass_says_otherwise(void **state)
     }
 }
 
+/* ---- the Gaussian mode */
+
+/* A building tree in the twin's form. */
+static dn_tree to_twin(const uint32_t *child, const double *mass, uint32_t count)
+{
+    dn_tree t = {0, dn_allocate(4 * (size_t)count, sizeof *t.child), dn_allocate(4 * (size_t)count, sizeof *t.value)};
+    uint32_t *number = dn_allocate(count, sizeof *number);
+    for (uint32_t i = 0; i < count; ++i)
+        number[i] = child[i] ? t.count++ : 0;
+    for (uint32_t i = 0; i < count; ++i)
+        for (uint32_t k = 0; child[i] && k < 4; ++k) {
+            t.child[4 * number[i] + k] = number[child[i] + k];
+            t.value[4 * number[i] + k] = mass[child[i] + k];
+        }
+    free(number);
+    return t;
+}
+
+static tree *make_deep_tree(uint64_t seed, uint32_t deepest)
+{
+    for (;; seed += 1000) {
+        tree *t = make_tree(seed, deepest, 0.6);
+        unsigned char height[MOST];
+        measure(t, seed & 1);
+        gsdi_gauss_heights(t->child, t->count, height);
+        if (height[0] == deepest)
+            return t;
+        free(t);
+    }
+}
+
+static gsdi_gauss_slot make_slot(uint32_t depth)
+{
+    gsdi_gauss_slot slot;
+    uint64_t bytes[5];
+    memset(&slot, 0, sizeof slot);
+    slot.memory = malloc((size_t)gsdi_gauss_parts(depth, bytes));
+    assert_non_null(slot.memory);
+    slot.depth = depth;
+    gsdi_gauss_slot_cut(&slot, depth);
+    return slot;
+}
+
+static void assert_near_matrix(const float *m, size_t stride, const dn_matrix *truth, double total, const char *what)
+{
+    for (uint32_t row = 0; row < truth->width; ++row)
+        for (uint32_t column = 0; column < truth->width; ++column) {
+            double got = (double)m[row * stride + column], want = truth->v[(size_t)row * truth->width + column] / total;
+            if (!(fabs(got - want) <= 1e-5 * want + 1e-29))
+                fail_msg("%s: (%u, %u) of %u: %g, expected %g", what, row, column, truth->width, got, want);
+        }
+}
+
+/* One layer of one tree by all levels, full and by blocks, against the twin. */
+static void check_layer(const tree *t, const dn_tree *twin, const unsigned char *height, gsdi_gauss_slot *slot,
+                        uint32_t layer, double sigma, dn_border border)
+{
+    uint32_t width = 1u << layer;
+    size_t stride = gsdi_gauss_stride(width), runs;
+    float w[4], *m = slot->matrix[0];
+    dn_matrix flat = dn_flatten(twin, layer);
+    unsigned char *mask = dn_mask(twin, layer, border);
+    dn_matrix truth = dn_blur(&flat, sigma, border, mask);
+    gsdi_gauss_weights(sigma, w);
+    for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_NEON; ++level) {
+        double sum = 0;
+        if (gsdi_simd((gsd_simd)level) != (gsd_simd)level)
+            continue;
+        gsdi_gauss_flatten(t->child, t->mass, height, layer, m, stride);
+        assert_near_matrix(m, stride, &flat, t->mass[0], "flat");
+        gsdi_gauss_pad(m, stride, width, border == DN_SPHERE);
+        gsdi_gauss_full((gsd_simd)level, m, slot->packed, width, w);
+        assert_near_matrix(slot->packed, width, &truth, t->mass[0], "whole");
+        for (size_t i = 0; i < (size_t)width * width; ++i)
+            sum += (double)slot->packed[i];
+        if (border == DN_SPHERE)
+            assert_true(fabs(sum * t->mass[0] - dn_sum(&flat)) <= 1e-6 * dn_sum(&flat));
+        gsdi_gauss_map(t->child, layer, slot->map);
+        runs = gsdi_gauss_runs(slot->map, width, 0, width / GSDI_GAUSS_ROWS, slot->run);
+        gsdi_gauss_packed((gsd_simd)level, m, slot->packed, width, slot->run, runs, w);
+        gsdi_gauss_unpack(slot->packed, slot->run, runs, m, stride);
+        assert_near_matrix(m, stride, &truth, t->mass[0], "blocks");
+    }
+    dn_free_matrix(&flat);
+    dn_free_matrix(&truth);
+    free(mask);
+}
+
+static void test_gaussian_layers_match_the_twin(void **state)
+{
+    (void)state;
+    static const double sigmas[] = {0.8, 0.3, 2.5};
+    for (uint32_t deepest = 6; deepest <= 9; ++deepest)
+        for (int border = DN_ZERO; border <= DN_SPHERE; ++border) {
+            tree *t = make_deep_tree(deepest, deepest);
+            unsigned char height[MOST];
+            dn_tree twin = to_twin(t->child, t->mass, t->count);
+            gsdi_gauss_slot slot = make_slot(deepest);
+            gsdi_gauss_heights(t->child, t->count, height);
+            assert_int_equal(dn_depth(&twin, 0), deepest);
+            for (uint32_t layer = 6; layer <= deepest; ++layer)
+                check_layer(t, &twin, height, &slot, layer, sigmas[(deepest + layer) % 3], (dn_border)border);
+            free(slot.memory);
+            dn_free_tree(&twin);
+            free(t);
+        }
+}
+
+/* The two trees divide alike but within rounding of the threshold, and have the same masses. node of got is inner. */
+static void compare_trees(const tree *got, uint32_t node, const dn_tree *want, uint32_t twin, double limit,
+                          double total)
+{
+    for (uint32_t k = 0; k < 4; ++k) {
+        uint32_t c = got->child[node] + k, d = want->child[4 * twin + k];
+        double mass = want->value[4 * twin + k];
+        if (fabs(got->mass[c] - mass) > 2e-5 * mass + 1e-28 * total)
+            fail_msg("mass %g, expected %g of %g", got->mass[c], mass, total);
+        if (!got->child[c] != !d)
+            assert_true(fabs(mass - limit) <= 1e-5 * limit);
+        else if (d)
+            compare_trees(got, c, want, d, limit, total);
+    }
+}
+
+static void test_gaussian_trees_match_the_twin(void **state)
+{
+    (void)state;
+    for (uint32_t i = 0; i < 12; ++i) {
+        uint32_t deepest = 6 + i % 4;
+        double rho = i % 3 ? 0.003 : 0.02;
+        dn_options o = {
+            .first_layer = 6, .sigma = 0.8, .border = i & 1 ? DN_SPHERE : DN_ZERO, .mask = true, .rho = rho};
+        tree *t = make_deep_tree(100 + i, deepest), *made = calloc(1, sizeof *made);
+        unsigned char height[MOST];
+        float w[4];
+        dn_tree twin = to_twin(t->child, t->mass, t->count), expected;
+        gsdi_gauss_slot slot = make_slot(deepest + (i & 1));
+        slot.depth = deepest;
+        o.max_depth = deepest;
+        expected = dn_denoise(&twin, &o);
+        double sum = dn_mass(&expected, 0), old[2] = {t->sum[0].half[0], t->sum[0].half[1]}, now[2] = {0, 0};
+        for (uint32_t k = 0; k < 4 * expected.count; ++k) /* to the mass before */
+            expected.value[k] *= t->mass[0] / sum;
+        gsdi_gauss_weights(o.sigma, w);
+        gsdi_gauss_heights(t->child, t->count, height);
+        for (int level = GSD_SIMD_SCALAR; level <= GSD_SIMD_NEON; ++level) {
+            if (gsdi_simd((gsd_simd)level) != (gsd_simd)level)
+                continue;
+            gsdi_gauss_blur(&slot, t->child, t->mass, height, (gsd_simd)level, o.border == DN_SPHERE, w);
+            made->count = gsdi_gauss_rebuild(&slot, rho, t->child, t->sum, NULL, NULL, NULL);
+            assert_true(made->count > 4 && made->count < MOST);
+            assert_int_equal(gsdi_gauss_rebuild(&slot, rho, t->child, t->sum, made->child, made->sum, made->mass),
+                             made->count);
+            gsdi_gauss_normalise(made->child, made->mass, made->count, t->mass[0]);
+            assert_true(fabs(made->mass[0] - t->mass[0]) <= 1e-12 * t->mass[0]);
+            compare_trees(made, 0, &expected, 0, rho * t->mass[0], t->mass[0]);
+        }
+        for (uint32_t n = 0; n < made->count; ++n)
+            for (int h = 0; h < 2 && !made->child[n]; ++h)
+                now[h] += made->sum[n].half[h];
+        assert_true(fabs(now[0] - old[0]) <= 1e-9 * old[0] && fabs(now[1] - old[1]) <= 1e-9 * old[1]);
+        dn_free_tree(&expected);
+        dn_free_tree(&twin);
+        free(slot.memory);
+        free(made);
+        free(t);
+    }
+}
+
+/* Make t the building tree of a cell of a forest, all of whose cells have one node so far or were planted before. */
+static void plant(gsd_field *f, uint32_t cell, const tree *t, double samples)
+{
+    gsdi_state *s = &f->states[cell];
+    uint32_t nodes = f->building_nodes + t->count;
+    uint32_t *child = f->desc.allocate(f->desc.user, nodes * sizeof *child);
+    gsdi_sum *sum = f->desc.allocate(f->desc.user, nodes * sizeof *sum);
+    memcpy(child, f->child, f->building_nodes * sizeof *child);
+    memcpy(sum, f->sum, f->building_nodes * sizeof *sum);
+    memcpy(child + f->building_nodes, t->child, t->count * sizeof *child);
+    for (uint32_t i = 0; i < t->count; ++i) /* inner sums are scratch */
+        memset(&sum[f->building_nodes + i], 0, sizeof *sum);
+    for (uint32_t i = 0; i < t->count; ++i)
+        if (!t->child[i])
+            sum[f->building_nodes + i] = t->sum[i];
+    s->first = f->building_nodes;
+    s->count = t->count;
+    s->held = s->lit = s->fresh = samples;
+    f->desc.release(f->desc.user, f->child);
+    f->desc.release(f->desc.user, f->sum);
+    f->child = child;
+    f->sum = sum;
+    f->building_nodes = f->node_capacity = nodes;
+    gsdi_field_changed(f);
+}
+
+static gsd_field *gaussian_forest(gsd_desc d, uint32_t cells)
+{
+    gsd_field *f;
+    d.forest_cells = cells;
+    d.denoise = GSD_DENOISE_GAUSSIAN;
+    d.max_depth = d.max_depth ? d.max_depth : 20;
+    d.smoothing = 0.001f;
+    OK(gsd_create(&d, &f));
+    return f;
+}
+
+static gsd_tree exported(const gsd_field *f, gsd_part part, uint32_t cell)
+{
+    gsd_tree t = {cell, gsd_export_bound(f, part, cell), NULL, NULL};
+    t.child = calloc(4 * (size_t)t.count, sizeof *t.child);
+    t.value = calloc(4 * (size_t)t.count, sizeof *t.value);
+    OK(gsd_export_tree(f, part, &t));
+    return t;
+}
+
+static void free_exported(gsd_tree *t)
+{
+    free(t->child);
+    free(t->value);
+}
+
+static bool same_trees(const gsd_tree *a, const gsd_tree *b)
+{
+    return a->count == b->count && !memcmp(a->child, b->child, 4 * (size_t)a->count * sizeof *a->child) &&
+           !memcmp(a->value, b->value, 4 * (size_t)a->count * sizeof *a->value);
+}
+
+/* Shares of a sampling tree against the twin's masses, smoothed as desc.smoothing says: `even` is added to each child's
+   samples. */
+static void compare_shares(const gsd_tree *got, uint32_t node, const dn_tree *want, uint32_t twin, double share,
+                           double limit, double scale, double even)
+{
+    double m[4], total = 0;
+    for (int k = 0; k < 4; ++k)
+        total += m[k] = scale * want->value[4 * twin + (uint32_t)k] + even;
+    for (uint32_t k = 0; k < 4; ++k) {
+        uint32_t c = got->child[4 * node + k], d = want->child[4 * twin + k];
+        double s = share * m[k] / total, g = (double)got->value[4 * node + k];
+        if (fabs(g - s) > 1e-4 * s + 1e-9)
+            fail_msg("share %g, expected %g", g, s);
+        if (!c != !d)
+            assert_true(fabs(want->value[4 * twin + k] - limit) <= 1e-5 * limit);
+        else if (d)
+            compare_shares(got, c, want, d, s, limit, scale, even);
+    }
+}
+
+/* Fields that learn, then one pass denoised: what queries see is what the twin makes of the building trees. */
+static void test_gaussian_refine_matches_the_twin(void **state)
+{
+    (void)state;
+    static const gsd_target targets[] = {GSD_TARGET_RADIANCE, GSD_TARGET_SIMPLE};
+    for (int i = 0; i < 2; ++i) {
+        gsd_desc d = {.denoise = GSD_DENOISE_OFF,
+                      .target = targets[i],
+                      .rho = 0.002f,
+                      .split_samples = 10000,
+                      .smoothing = 0.001f,
+                      .gaussian_sphere = i == 1,
+                      .gaussian_rho = 0.005f,
+                      .no_gate = true,
+                      .max_depth = 9};
+        gsd_pass pass = {.denoise = GSD_DENOISE_GAUSSIAN};
+        dn_options o = {.first_layer = 6, .sigma = 0.8, .border = i ? DN_SPHERE : DN_ZERO, .mask = true, .rho = 0.005};
+        gsd_field *f;
+        gsd_stream *s;
+        gsd_stats stats;
+        gsd_tree old[64];
+        double lit[64];
+        o.rho = (double)0.005f;
+        learn_box(&d, 20000, NULL, NULL, &f);
+        OK(gsd_stream_create(f, &s));
+        record_box(s, 20000);
+        OK(gsd_accumulate(f, &s, 1, NULL, NULL));
+        uint32_t cells = gsd_cell_count(f), deep = 0;
+        assert_true(cells >= 4 && cells <= 64);
+        for (uint32_t c = 0; c < cells; ++c) {
+            old[c] = exported(f, GSD_PART_BUILDING, c);
+            lit[c] = f->states[c].lit;
+        }
+        OK(gsd_refine(f, &pass, NULL, NULL));
+        OK(gsd_validate(f));
+        gsd_get_stats(f, &stats);
+        for (uint32_t c = 0; c < cells; ++c) {
+            gsd_tree now = exported(f, GSD_PART_SAMPLING, c);
+            dn_tree twin = dn_make_tree(old[c].count, old[c].child, old[c].value);
+            o.max_depth = dn_depth(&twin, 0);
+            assert_true(o.max_depth <= 10);
+            deep += o.max_depth >= 6;
+            dn_tree expected = dn_denoise(&twin, &o);
+            double sum = dn_mass(&expected, 0);
+            compare_shares(&now, 0, &expected, 0, 1, o.rho * sum, lit[c] / sum, 0.00025);
+            dn_free_tree(&twin);
+            dn_free_tree(&expected);
+            free_exported(&now);
+            free_exported(&old[c]);
+        }
+        assert_true(deep >= 4);
+        assert_int_equal(stats.denoised_trees, deep);
+        assert_int_equal(stats.shallow_trees, cells - deep);
+        assert_int_equal(stats.smooth_trees + stats.over_budget_trees + stats.deep_trees, 0);
+        gsd_stream_destroy(s);
+        gsd_destroy(f);
+    }
+}
+
+static void test_gaussian_work_is_limited(void **state)
+{
+    (void)state;
+    enum { CELLS = 40 };
+    for (int k = 0; k < 4; ++k) {
+        uint32_t depth[CELLS], deep = 0, shallow = 0, count = 0, over = 0;
+        bool admitted[CELLS], no_limit = k == 3;
+        gsd_field *f = gaussian_forest((gsd_desc){.gaussian_no_limit = no_limit, .rho = 1e-5f}, CELLS), *off;
+        gsd_pass pass = {.denoise = GSD_DENOISE_OFF};
+        gsd_stats stats;
+        for (uint32_t c = 0; c < CELLS; ++c) {
+            depth[c] = c % 7 == 3 ? 4 + c % 3 : c % 7 == 5 ? 11 + c % 5 : no_limit ? 6 + c % 3 : 8 + c % 3;
+            tree *t = make_tree(c + 1, depth[c], -1);
+            plant(f, c, t, 1000);
+            free(t);
+        }
+        f->passes = k == 2 ? 1 : 0;
+        dn_admit(CELLS, depth, 6, f->passes, admitted);
+        size_t size = gsd_save_bound(f);
+        void *data = malloc(size);
+        OK(gsd_save(f, data, size, &size));
+        OK(gsd_load(NULL, data, size, &off));
+        OK(gsd_refine(f, NULL, NULL, NULL));
+        OK(gsd_refine(off, &pass, NULL, NULL));
+        OK(gsd_validate(f));
+        for (uint32_t c = 0; c < CELLS; ++c) {
+            gsd_tree a = exported(f, GSD_PART_SAMPLING, c), b = exported(off, GSD_PART_SAMPLING, c);
+            bool wanted = no_limit ? depth[c] >= 6 && depth[c] <= 12 : admitted[c];
+            assert_int_equal(!same_trees(&a, &b), wanted);
+            deep += depth[c] > (no_limit ? 12 : 10);
+            shallow += depth[c] < 6;
+            over += depth[c] >= 6 && depth[c] <= (no_limit ? 12 : 10) && !wanted;
+            count += wanted;
+            free_exported(&a);
+            free_exported(&b);
+        }
+        gsd_get_stats(f, &stats);
+        assert_true(stats.denoised_trees == count && stats.deep_trees == deep && stats.shallow_trees == shallow &&
+                    stats.over_budget_trees == over);
+        assert_true(k < 2 ? over > 0 : over == 0);
+        assert_int_equal(count + deep + shallow + over, stats.rebuilt_trees);
+        free(data);
+        gsd_destroy(f);
+        gsd_destroy(off);
+    }
+}
+
+static void test_gaussian_survives_hostile_trees(void **state)
+{
+    (void)state;
+    int denoised = 0;
+    for (uint32_t deepest = 1; deepest <= 20; ++deepest)
+        for (int kind = 0; kind < 6; ++kind) {
+            gsd_desc d = {.target = kind & 1 ? GSD_TARGET_SIMPLE : GSD_TARGET_RADIANCE,
+                          .gaussian_no_limit = true,
+                          .gaussian_sphere = deepest & 1,
+                          .gaussian_sigma = kind == 2   ? 0.1f
+                                            : kind == 4 ? 100
+                                                        : 0,
+                          .gaussian_rho = kind == 5 ? 1 : 0};
+            gsd_field *f = gaussian_forest(d, 1);
+            tree *t = make_tree(deepest * 10 + (uint32_t)kind, deepest, deepest > 9 || kind == 0 ? -1 : 0.6);
+            gsd_stats stats;
+            for (uint32_t i = 0; i < t->count; ++i)
+                for (int k = 0; k < 2; ++k) {
+                    double *x = &t->sum[i].half[k];
+                    if (kind == 1) /* one hot leaf */
+                        *x = i == t->count - 1 ? 1e30 : 0;
+                    else if (kind == 2) /* contrast 1e60 */
+                        *x = pow(10, 60 * rnd() - 30);
+                    else if (kind == 3) /* all equal */
+                        *x = 1;
+                    else if (kind == 4) /* nothing at all, or as much as a loaded sum may hold */
+                        *x = deepest & 2 ? 0 : 1e296;
+                }
+            plant(f, 0, t, 1000);
+            OK(gsd_refine(f, NULL, NULL, NULL));
+            OK(gsd_validate(f));
+            gsd_get_stats(f, &stats);
+            assert_int_equal(stats.denoised_trees + stats.shallow_trees + stats.deep_trees + stats.over_budget_trees,
+                             stats.rebuilt_trees);
+            denoised += (int)stats.denoised_trees;
+            gsd_tree out = exported(f, GSD_PART_SAMPLING, 0);
+            double sum = 0;
+            for (uint32_t k = 0; k < 4 * out.count; ++k) {
+                assert_true(out.value[k] >= 0 && out.value[k] <= 1.0001f);
+                sum += out.child[k] ? 0 : (double)out.value[k];
+            }
+            assert_true(fabs(sum - 1) < 1e-4);
+            free_exported(&out);
+            free(t);
+            gsd_destroy(f);
+        }
+    assert_true(denoised >= 30);
+}
+
+/* An allocator that counts and fails. */
+typedef struct counter {
+    long live, requests, fail_at;
+    size_t bytes, peak;
+} counter;
+
+static void *count_allocate(void *user, size_t size)
+{
+    counter *c = user;
+    size_t *p = ++c->requests == c->fail_at ? NULL : malloc(size + 16);
+    if (!p)
+        return NULL;
+    *p = size;
+    c->live++;
+    c->bytes += size;
+    c->peak = c->bytes > c->peak ? c->bytes : c->peak;
+    return (char *)p + 16;
+}
+
+static void count_release(void *user, void *pointer)
+{
+    counter *c = user;
+    if (!pointer)
+        return;
+    c->live--;
+    c->bytes -= *(size_t *)(void *)((char *)pointer - 16);
+    free((char *)pointer - 16);
+}
+
+static gsd_field *loaded(counter *c, const void *data, size_t size)
+{
+    gsd_desc d = {.allocate = count_allocate, .release = count_release, .user = c};
+    gsd_field *f;
+    OK(gsd_load(&d, data, size, &f));
+    return f;
+}
+
+static void assert_saves_as(const gsd_field *f, const void *data, size_t size)
+{
+    void *now = malloc(gsd_save_bound(f));
+    size_t bytes;
+    OK(gsd_save(f, now, gsd_save_bound(f), &bytes));
+    assert_int_equal(bytes, size);
+    assert_memory_equal(now, data, size);
+    free(now);
+}
+
+/* Five trees, serially and by two threads: each allocation fails once. */
+static void test_gaussian_survives_failed_allocations(void **state)
+{
+    (void)state;
+    for (int threads = 0; threads < 2; ++threads) {
+        crowd team = {2, 1};
+        gsd_parallel_fn parallel = threads ? crowd_for : NULL;
+        gsd_field *f = gaussian_forest((gsd_desc){.rho = 0.001f}, 5);
+        for (uint32_t c = 0; c < 5; ++c) {
+            tree *t = make_deep_tree(c + 1, 6 + c % 2);
+            plant(f, c, t, 1000);
+            free(t);
+        }
+        size_t before, after, size = gsd_save_bound(f);
+        void *data = malloc(size), *good;
+        OK(gsd_save(f, data, size, &before));
+        gsd_destroy(f);
+        counter c = {0};
+        f = loaded(&c, data, before);
+        assert_saves_as(f, data, before);
+        long start = c.requests;
+        OK(gsd_refine(f, NULL, parallel, &team));
+        long requests = c.requests - start;
+        good = malloc(gsd_save_bound(f));
+        OK(gsd_save(f, good, gsd_save_bound(f), &after));
+        gsd_destroy(f);
+        assert_int_equal(c.live, 0);
+        assert_true(requests > 15);
+        for (long k = 1; k <= requests; ++k) {
+            memset(&c, 0, sizeof c);
+            f = loaded(&c, data, before);
+            c.fail_at = c.requests + k;
+            assert_int_equal(gsd_refine(f, NULL, parallel, &team), GSD_OUT_OF_MEMORY);
+            OK(gsd_validate(f));
+            for (uint32_t i = 0; i < f->building_nodes; ++i) /* inner sums are scratch */
+                if (f->child[i])
+                    memset(&f->sum[i], 0, sizeof f->sum[i]);
+            assert_saves_as(f, data, before);
+            OK(gsd_refine(f, NULL, parallel, &team));
+            assert_saves_as(f, good, after);
+            gsd_destroy(f);
+            assert_int_equal(c.live, 0);
+        }
+        free(data);
+        free(good);
+    }
+}
+
+static void test_gaussian_stays_under_max_bytes(void **state)
+{
+    (void)state;
+    uint32_t over = 0, denoised = 0;
+    for (int k = 0; k < 12; ++k) {
+        counter c = {0};
+        gsd_desc d = {.bounds_max = {1, 1, 1},
+                      .max_bytes = (uint64_t)(1 << 20) << k / 3,
+                      .rho = 0.0005f,
+                      .denoise = GSD_DENOISE_GAUSSIAN,
+                      .gaussian_rho = k % 3 == 0 ? 1e-5f : 0.001f,
+                      .min_samples = 1,
+                      .split_samples = 100,
+                      .gaussian_no_limit = true,
+                      .alias = k & 1,
+                      .allocate = count_allocate,
+                      .release = count_release,
+                      .user = &c};
+        crowd team = {2, 1};
+        gsd_field *f;
+        gsd_stream *s;
+        OK(gsd_create(&d, &f));
+        OK(gsd_stream_create(f, &s));
+        rng_state = 9;
+        for (int pass = 0; pass < 5; ++pass) {
+            gsd_stats stats;
+            record_box(s, 20000);
+            OK(gsd_accumulate(f, &s, 1, NULL, NULL));
+            size_t others = c.bytes; /* stream and scratch are outside the cap */
+            gsd_get_stats(f, &stats);
+            others -= (size_t)stats.bytes;
+            gsd_stream_clear(s);
+            c.peak = c.bytes;
+            OK(gsd_refine(f, NULL, k % 2 ? crowd_for : NULL, &team));
+            OK(gsd_validate(f));
+            gsd_get_stats(f, &stats);
+            if (c.peak - others > d.max_bytes || stats.peak_bytes > d.max_bytes)
+                fail_msg("cap %llu: %llu held", (unsigned long long)d.max_bytes, (unsigned long long)(c.peak - others));
+            assert_true((double)(c.peak - others) <= 1.02 * (double)stats.peak_bytes);
+            over += stats.over_budget_trees;
+            denoised += stats.denoised_trees;
+        }
+        gsd_stream_destroy(s);
+        gsd_destroy(f);
+        assert_int_equal(c.live, 0);
+    }
+    print_message("%u trees denoised, %u not for want of memory\n", denoised, over);
+    assert_true(over > 0 && denoised > 100);
+}
+
+/* Fields that fill the cap: trees whose results would not leave room for the new part are left alone, so that a refine
+   that fits without denoising fits with it too. */
+static void test_gaussian_gives_back_what_does_not_fit(void **state)
+{
+    (void)state;
+    uint32_t back = 0, fitted = 0;
+    for (uint32_t cells = 100; cells <= 180; cells += 4) {
+        gsd_desc d = {.max_bytes = 1 << 20, .gaussian_rho = 0.004f, .gaussian_sigma = 3, .gaussian_no_limit = true};
+        gsd_field *f = gaussian_forest(d, cells), *off;
+        gsd_pass pass = {.denoise = GSD_DENOISE_OFF};
+        gsd_stats stats, plain;
+        tree *t = make_tree(7, 6, -1);
+        for (uint32_t c = 0; c < cells; ++c)
+            plant(f, c, t, 1000);
+        free(t);
+        size_t size = gsd_save_bound(f);
+        void *data = malloc(size);
+        OK(gsd_save(f, data, size, &size));
+        OK(gsd_load(NULL, data, size, &off));
+        OK(gsd_refine(off, &pass, NULL, NULL));
+        OK(gsd_refine(f, NULL, NULL, NULL));
+        OK(gsd_validate(f));
+        gsd_get_stats(f, &stats);
+        gsd_get_stats(off, &plain);
+        assert_int_equal(stats.denoised_trees + stats.over_budget_trees, cells);
+        if (plain.peak_bytes <= d.max_bytes) {
+            fitted++;
+            back += stats.denoised_trees > 0 && stats.over_budget_trees > 0;
+            assert_true(stats.peak_bytes <= d.max_bytes);
+        }
+        free(data);
+        gsd_destroy(f);
+        gsd_destroy(off);
+    }
+    print_message("%u fields fit, %u of them denoised in part\n", fitted, back);
+    assert_true(fitted > 10 && back > 3);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -561,6 +1158,14 @@ int main(void)
         cmocka_unit_test(test_steps_are_told),
         cmocka_unit_test(test_pass_says_otherwise),
         cmocka_unit_test(test_any_threads_give_the_same_field),
+        cmocka_unit_test(test_gaussian_layers_match_the_twin),
+        cmocka_unit_test(test_gaussian_trees_match_the_twin),
+        cmocka_unit_test(test_gaussian_refine_matches_the_twin),
+        cmocka_unit_test(test_gaussian_work_is_limited),
+        cmocka_unit_test(test_gaussian_survives_hostile_trees),
+        cmocka_unit_test(test_gaussian_survives_failed_allocations),
+        cmocka_unit_test(test_gaussian_stays_under_max_bytes),
+        cmocka_unit_test(test_gaussian_gives_back_what_does_not_fit),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

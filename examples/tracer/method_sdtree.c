@@ -3,10 +3,12 @@
    Options (--set key=value), defaults as in guide_sdtree.h: target=radiance|simple|variance|switching, switch_after, c
    (samples of a cell before it splits), rho, smoothing, max_depth, max_levels, min_samples, max_memory_mb,
    spatial_filter=nearest|stochastic, directional_filter=nearest|box, learn_alpha=grid|adam|off (on = grid), alpha,
-   gate=on|off, gate_margin, gate_gain, gate_probe, guide_weight=on|off, history=on|off, denoise=on|off, denoise_budget,
-   denoise_when=training|last (in every refine, or only in that which ends --train),
-   uniform, alias=on|off, simd=scalar|avx2|avx512, product=on|off (with the cosine), jitter=on|off (find looks up a
-   jittered position), sparse=on|off (closed fields record only some tiles). */
+   gate=on|off, gate_margin, gate_gain, gate_probe, guide_weight=on|off, history=on|off, denoise=on|off|gaussian,
+   denoise_budget,
+   denoise_when=training|last (in every refine, or only in that which ends --train); of denoise=gaussian: sigma,
+   gaussian_rho, gaussian_sphere=off|on, gaussian_limit=on|off; uniform, alias=on|off, simd=scalar|avx2|avx512|neon,
+   product=on|off (with the cosine), jitter=on|off (find looks up a jittered position), sparse=on|off (closed fields
+   record only some tiles). */
 #include <stdlib.h>
 #include <string.h>
 
@@ -110,15 +112,19 @@ static bool parse(parser *p, gsd_desc *d, sdtree *m)
     d->gate_probe = (uint32_t)number(p, "gate_probe", 0);
     d->no_guide_weight = choice(p, "guide_weight", "off|on") == 0;
     d->no_history = choice(p, "history", "off|on") == 0;
-    d->denoise = (gsd_denoise_mode)(choice(p, "denoise", "off|on") + GSD_DENOISE_OFF);
+    d->denoise = (gsd_denoise_mode)(choice(p, "denoise", "off|on|gaussian") + GSD_DENOISE_OFF);
     m->denoise_last = choice(p, "denoise_when", "training|last") == 1;
     if (m->denoise_last && d->denoise == GSD_DENOISE_OFF)
         complain(p, "denoise_when", "last", "denoise=on with it");
     else if (m->denoise_last && p->env->train == 0)
         complain(p, "denoise_when", "last", "--train, whose last refine it speaks of");
     d->denoise_budget = (float)number(p, "denoise_budget", 0);
+    d->gaussian_sigma = (float)number(p, "sigma", 0);
+    d->gaussian_rho = (float)number(p, "gaussian_rho", 0);
+    d->gaussian_sphere = choice(p, "gaussian_sphere", "off|on") == 1;
+    d->gaussian_no_limit = choice(p, "gaussian_limit", "off|on") == 0;
     d->alias = choice(p, "alias", "off|on") == 1;
-    d->simd = (gsd_simd)(choice(p, "simd", "scalar|avx2|avx512") + 1);
+    d->simd = (gsd_simd)(choice(p, "simd", "scalar|avx2|avx512|neon") + 1);
     m->product = choice(p, "product", "off|on") != 0;
     m->jitter = choice(p, "jitter", "off|on") == 1;
     m->sparse = choice(p, "sparse", "off|on") != 0;
@@ -326,7 +332,8 @@ static void sdtree_stats(void *method, tr_method_stats *stats)
              "\"nodes\": %llu, \"leaves\": %llu, \"building_nodes\": %llu, \"peak_bytes\": %llu, \"max_depth\": %u, "
              "\"mean_depth\": %.3f, \"effective_rho\": %.4g, \"split_cells\": %u, \"rebuilt_trees\": %u, "
              "\"waiting_cells\": %u, \"unread_cells\": %u, \"denoised_trees\": %u, \"smooth_trees\": %u, "
-             "\"over_budget_trees\": %u, \"denoised_leaves\": %llu, \"mean_blur\": %.3f, "
+             "\"over_budget_trees\": %u, \"shallow_trees\": %u, \"deep_trees\": %u, \"denoised_leaves\": %llu, "
+             "\"mean_blur\": %.3f, "
              "\"denoise_seconds\": %.6g, "
              "\"open_cells\": %u, \"closed_cells\": %u, "
              "\"unjudged_cells\": %u, \"opened\": %llu, \"closed\": %llu, \"probed\": %llu, \"closed_share\": %.4f, "
@@ -335,10 +342,10 @@ static void sdtree_stats(void *method, tr_method_stats *stats)
              (unsigned long long)s.lost, s.trees, (unsigned long long)s.nodes, (unsigned long long)s.leaves,
              (unsigned long long)s.building_nodes, (unsigned long long)s.peak_bytes, s.max_depth, (double)s.mean_depth,
              (double)s.effective_rho, s.split_cells, s.rebuilt_trees, s.waiting_cells, s.unread_cells, s.denoised_trees,
-             s.smooth_trees, s.over_budget_trees, (unsigned long long)s.denoised_leaves, (double)s.mean_blur,
-             m->denoise_seconds, s.open_cells, s.closed_cells, s.unjudged_cells, (unsigned long long)s.opened,
-             (unsigned long long)s.closed, (unsigned long long)s.probed, (double)s.closed_share, (double)s.mean_alpha,
-             (double)gsd_record_fraction(m->field));
+             s.smooth_trees, s.over_budget_trees, s.shallow_trees, s.deep_trees, (unsigned long long)s.denoised_leaves,
+             (double)s.mean_blur, m->denoise_seconds, s.open_cells, s.closed_cells, s.unjudged_cells,
+             (unsigned long long)s.opened, (unsigned long long)s.closed, (unsigned long long)s.probed,
+             (double)s.closed_share, (double)s.mean_alpha, (double)gsd_record_fraction(m->field));
 }
 
 const tr_method tr_method_sdtree = {.name = "sdtree",
