@@ -267,8 +267,8 @@ typedef struct gsd_desc {
     bool no_guide_weight; /* second-moment targets: w = 1 */
     bool no_history;      /* clear the sums in every refine; see HOW IT WORKS */
     gsd_denoise_mode denoise;
-    float denoise_budget;   /* leaves that refine may blur, for each sample so far and beyond 131,072; 0.001 .. 1e6;
-                               default 0.25: on usual machines 20 ns a sample */
+    float denoise_budget;   /* leaves that refine may blur, for each sample so far and beyond 32,768; 0.001 .. 1e6;
+                               default 0.15: about 10 ns a sample */
     float gaussian_sigma;   /* of GSD_DENOISE_GAUSSIAN, in elements of a layer's matrix, 0.1 .. 100; default 0.8 */
     float gaussian_rho;     /* as rho, of the trees it makes, 1e-5 .. 1; default 0: rho */
     bool gaussian_sphere;   /* phi wraps and poles are crossed; the thesis has zeros outside the matrix */
@@ -987,12 +987,12 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_SPLIT 2.0            /* a cell splits above that times sqrt(samples held): tuned on SF1 (1 .. 2), ajar */
 #define GSDI_MIN_SPLIT 32.0       /* at least */
 #define GSDI_LIT                                                                                                       \
-    24.0                      /* ... times its share of non-zero samples: parts of a dark cell would know too little;  \
-                                 tuned on lamps, ajar (8 .. 32) */
-#define GSDI_BLUR_EVEN 0.05   /* share of evenness in the density that one half of the samples says of the other */
-#define GSDI_BLUR_MOST 0.6    /* of the way towards the surroundings, for one half */
-#define GSDI_BLUR_STEPS 5     /* halvings of the interval that holds the best blur */
-#define GSDI_BLUR_FREE 131072 /* leaves that are blurred whatever the budget */
+    24.0                     /* ... times its share of non-zero samples: parts of a dark cell would know too little;   \
+                                tuned on lamps, ajar (8 .. 32) */
+#define GSDI_BLUR_EVEN 0.05  /* share of evenness in the density that one half of the samples says of the other */
+#define GSDI_BLUR_MOST 0.6   /* of the way towards the surroundings, for one half */
+#define GSDI_BLUR_STEPS 5    /* halvings of the interval that holds the best blur */
+#define GSDI_BLUR_FREE 32768 /* leaves that are blurred whatever the budget */
 #define GSDI_MAX_CELLS (1u << 26)
 
 /* ---- >>memory ----------------------------------------------------------------------------------------------- */
@@ -1446,11 +1446,12 @@ static uint32_t gsdi_refine_tree(const uint32_t *child, const gsdi_sum *sum, con
 
 /* What the blur reads and writes of one building tree, shares of the half's or the tree's mass; [nodes] each. */
 typedef struct gsdi_blur {
-    float *half[2]; /* masses that each half of the samples gives, all nodes */
-    float *near[3]; /* leaves: mean of the eight squares around, of each half and of both */
+    float *half[2]; /* masses that each half of the samples gives, all nodes; of inner ones 0 once moves are known */
+    float *near[3]; /* leaves: mean of the eight squares around, of each half and of both; then how far halves move */
+    float *even;    /* mass of both halves, all nodes; then the density's share of evenness in each leaf */
     double *mass;   /* of both halves, all nodes, not divided by their sum */
 } gsdi_blur;
-#define GSDI_BLUR_FLOATS 5 /* a node */
+#define GSDI_BLUR_FLOATS 6 /* a node */
 
 /* Cut `work` [GSDI_BLUR_FLOATS * nodes] into the parts of a blur. */
 static gsdi_blur gsdi_blur_make(float *work, uint32_t nodes, double *mass)
@@ -1458,7 +1459,7 @@ static gsdi_blur gsdi_blur_make(float *work, uint32_t nodes, double *mass)
     gsdi_blur b;
     uint32_t k;
     for (k = 0; k < GSDI_BLUR_FLOATS; ++k)
-        *(k < 2 ? &b.half[k] : &b.near[k - 2]) = work + (size_t)k * nodes;
+        *(k < 2 ? &b.half[k] : k < 5 ? &b.near[k - 2] : &b.even) = work + (size_t)k * nodes;
     b.mass = mass;
     return b;
 }
@@ -1467,7 +1468,7 @@ static gsdi_blur gsdi_blur_make(float *work, uint32_t nodes, double *mass)
    above. Row by row, upwards in z. */
 typedef struct gsdi_around {
     uint32_t node, near[9];
-    int32_t x, y; /* in units of its size */
+    int32_t y; /* in units of its size */
     unsigned char depth, up[9];
 } gsdi_around;
 
@@ -1475,116 +1476,152 @@ typedef struct gsdi_around {
    pole comes back at phi + half a turn. */
 static void gsdi_around_child(const uint32_t *child, const gsdi_around *parent, uint32_t k, gsdi_around *out)
 {
+    /* along an axis, for the lower and the upper child: square of the parent's, and half of it */
+    static const unsigned char square[2][3] = {{0, 1, 1}, {1, 1, 2}}, half[2][3] = {{1, 0, 1}, {0, 1, 0}};
+    const unsigned char *sx = square[k & 1], *sy = square[k >> 1], *hx = half[k & 1], *hy = half[k >> 1];
     int32_t size, i, j;
     out->node = child[parent->node] + k;
     out->depth = (unsigned char)(parent->depth + 1);
-    out->x = 2 * parent->x + (int32_t)(k & 1);
     out->y = 2 * parent->y + (int32_t)(k >> 1);
     size = (int32_t)(1u << out->depth);
-    for (j = -1; j <= 1; ++j)
-        for (i = -1; i <= 1; ++i) {
-            int32_t x = (int32_t)(k & 1) + i, y = (int32_t)(k >> 1) + j; /* -1 .. 2, from the parent's corner */
-            int32_t from = (x + 2) / 2 + 3 * ((y + 2) / 2), to = (i + 1) + 3 * (j + 1);
-            uint32_t c = parent->up[from] ? 0 : child[parent->near[from]];
-            x += 2 * parent->x;
-            y += 2 * parent->y;
-            if (y < 0 || y >= size) {
-                y = y < 0 ? -1 - y : 2 * size - 1 - y;
-                x += size / 2;
-            }
-            out->near[to] = c ? c + (uint32_t)((x & 1) + 2 * (y & 1)) : parent->near[from];
+    for (j = 0; j < 3; ++j) {
+        bool pole = out->y + j - 1 < 0 || out->y + j - 1 >= size;
+        for (i = 0; i < 3; ++i) {
+            uint32_t from = sx[i] + 3u * sy[j], to = (uint32_t)(i + 3 * j), c;
+            uint32_t x = hx[i] ^ (uint32_t)(pole && size == 2), y = hy[j] ^ (uint32_t)pole;
+            c = parent->up[from] ? 0 : child[parent->near[from]];
+            out->near[to] = c ? c + x + 2 * y : parent->near[from];
             out->up[to] = (unsigned char)(c ? 0 : parent->up[from] + 1);
-        }
-}
-
-/* Means around every leaf, sides counting twice as much as corners. A leaf that is larger counts with the share of its
-   area, a divided square with its sum. */
-static void gsdi_blur_near(const uint32_t *child, gsdi_blur *b)
-{
-    static const float weight[9] = {1, 2, 1, 2, 0, 2, 1, 2, 1};
-    gsdi_around stack[GSDI_STACK];
-    uint32_t top = 0, k;
-    double scale = 1 / b->mass[0];
-    memset(&stack[0], 0, sizeof stack[0]);
-    for (++top; top;) {
-        gsdi_around at = stack[--top];
-        if (child[at.node]) {
-            for (k = 4; k-- > 0;)
-                gsdi_around_child(child, &at, k, &stack[top++]);
-        } else {
-            float sum[3] = {0, 0, 0};
-            for (k = 0; k < 9; ++k) {
-                uint32_t n = at.near[k];
-                float w = weight[k] / 12 / (float)((uint64_t)1 << (2 * at.up[k]));
-                sum[0] += w * b->half[0][n];
-                sum[1] += w * b->half[1][n];
-                sum[2] += w * (float)(b->mass[n] * scale);
-            }
-            for (k = 0; k < 3; ++k)
-                b->near[k][at.node] = sum[k];
         }
     }
 }
 
-/* Masses of one half, as shares of their sum; false: there are none. */
-static bool gsdi_blur_half(const uint32_t *child, const gsdi_sum *sum, const unsigned char *depth, uint32_t count,
-                           bool second_moment, uint32_t half, float *mass)
+/* Masses of all nodes: of each half as shares of its sum, and of both. False: a half has none. */
+static bool gsdi_blur_masses(const uint32_t *child, const gsdi_sum *sum, const unsigned char *depth, uint32_t count,
+                             bool second_moment, gsdi_blur *b)
 {
-    double total = 0;
-    uint32_t i;
+    double total[2] = {0, 0}, scale = 1 / b->mass[0];
+    uint32_t i, k;
     for (i = 0; i < count; ++i)
-        total += child[i] ? 0 : gsdi_leaf_mass(sum[i].half[half], second_moment, depth[i]);
-    if (!(total > 1e-280))
+        for (k = 0; k < 2 && !child[i]; ++k) {
+            double m = gsdi_leaf_mass(sum[i].half[k], second_moment, depth[i]) * scale;
+            b->half[k][i] = (float)m;
+            total[k] += m;
+        }
+    if (!(total[0] > 1e-30) || !(total[1] > 1e-30))
         return false;
+    total[0] = 1 / total[0];
+    total[1] = 1 / total[1];
     for (i = count; i-- > 0;) {
-        const float *c = mass + child[i];
-        mass[i] = child[i] ? (c[0] + c[1]) + (c[2] + c[3])
-                           : (float)(gsdi_leaf_mass(sum[i].half[half], second_moment, depth[i]) / total);
+        b->even[i] = (float)(b->mass[i] * scale);
+        for (k = 0; k < 2; ++k) {
+            float *m = b->half[k];
+            uint32_t c = child[i];
+            m[i] = c ? (m[c] + m[c + 1]) + (m[c + 2] + m[c + 3]) : (float)((double)m[i] * total[k]);
+        }
     }
     return true;
 }
 
+/* Mean around a leaf, sides counting twice as much as corners, for either half and both. A leaf that is larger counts
+   with the share of its area, a divided square with its sum. part[u] = 4^-u. */
+static void gsdi_blur_mean(const gsdi_blur *b, const gsdi_around *at, const float *part, double total[3])
+{
+    static const float weight[9] = {1 / 12.0f, 1 / 6.0f,  1 / 12.0f, 1 / 6.0f, 0,
+                                    1 / 6.0f,  1 / 12.0f, 1 / 6.0f,  1 / 12.0f};
+    float sum[3] = {0, 0, 0};
+    uint32_t k;
+    for (k = 0; k < 9; ++k) {
+        uint32_t n = at->near[k];
+        float w = weight[k] * part[at->up[k]];
+        sum[0] += w * b->half[0][n];
+        sum[1] += w * b->half[1][n];
+        sum[2] += w * b->even[n];
+    }
+    for (k = 0; k < 3; ++k) {
+        b->near[k][at->node] = sum[k];
+        total[k] += (double)sum[k];
+    }
+}
+
+/* Means around the leaves of a divided tree, and their sums. */
+static void gsdi_blur_near(const uint32_t *child, gsdi_blur *b, double total[3])
+{
+    gsdi_around stack[GSDI_STACK], at;
+    float part[25];
+    uint32_t top = 0, k;
+    for (k = 0; k < 25; ++k)
+        part[k] = 1.0f / (float)((uint64_t)1 << (2 * k));
+    total[0] = total[1] = total[2] = 0;
+    memset(&stack[0], 0, sizeof stack[0]);
+    for (++top; top;) {
+        at = stack[--top];
+        for (k = 4; k-- > 0;) {
+            gsdi_around_child(child, &at, k, &stack[top]);
+            if (child[stack[top].node])
+                ++top;
+            else
+                gsdi_blur_mean(b, &stack[top], part, total);
+        }
+    }
+}
+
+/* For gsdi_blur_slope: how far the leaves of either half would move, and each leaf's share of evenness. Inner nodes get
+   zeros, which add nothing there. */
+static void gsdi_blur_moves(const uint32_t *child, const unsigned char *depth, uint32_t count, gsdi_blur *b,
+                            const double total[3])
+{
+    float part[25];
+    uint32_t i, k;
+    for (k = 0; k < 25; ++k)
+        part[k] = (float)(GSDI_BLUR_EVEN / (1 - GSDI_BLUR_EVEN) / (double)((uint64_t)1 << (2 * k)));
+    for (i = 0; i < count; ++i) {
+        b->even[i] = part[depth[i]];
+        for (k = 0; k < 2; ++k) {
+            float *own = &b->half[k][i];
+            *own = child[i] ? 0 : *own;
+            b->near[k][i] = child[i] ? 0 : (float)((double)b->near[k][i] / total[k]) - *own;
+        }
+    }
+}
+
 /* Slope over t of what each half says of the other: sum of mass_other log(density), where the density is that of the
-   half's masses moved by t towards their surroundings, with a share of evenness. It falls with t. */
-static double gsdi_blur_slope(const uint32_t *child, const unsigned char *depth, uint32_t count, const gsdi_blur *b,
-                              const double *scale, double t)
+   half's masses moved by t towards their surroundings, with a share of evenness. It falls with t. Node 0 is an inner
+   one; the others are summed in fours, as they come. */
+static double gsdi_blur_slope(uint32_t count, const gsdi_blur *b, float t)
 {
     double slope = 0;
-    uint32_t i, k;
-    for (i = 0; i < count; ++i) {
-        double even;
-        if (child[i])
-            continue;
-        even = GSDI_BLUR_EVEN / (1 - GSDI_BLUR_EVEN) / (double)((uint64_t)1 << (2 * depth[i]));
-        for (k = 0; k < 2; ++k) {
-            double own = (double)b->half[k][i], move = (double)b->near[k][i] * scale[k] - own;
-            slope += (double)b->half[1 - k][i] * move / (own + t * move + even);
-        }
+    uint32_t i = 1, k;
+    while (i < count) {
+        uint32_t end = count - i > 1024 ? i + 1024 : count;
+        float lane[4] = {0, 0, 0, 0};
+        for (; i < end; i += 4)
+            for (k = 0; k < 4; ++k) {
+                float a = b->half[0][i + k], c = b->half[1][i + k], e = b->even[i + k];
+                float da = b->near[0][i + k], dc = b->near[1][i + k];
+                lane[k] += c * da / (a + t * da + e) + a * dc / (c + t * dc + e);
+            }
+        slope += (double)((lane[0] + lane[1]) + (lane[2] + lane[3]));
     }
     return slope;
 }
 
-/* Blur the masses of one building tree in place. Returns how far they moved towards their surroundings: 0 = not at all,
-   what one half of the samples says of the other would get worse by any blur. */
+/* Blur the masses of one divided building tree in place. Returns how far they moved towards their surroundings: 0 = not
+   at all, what one half of the samples says of the other would get worse by any blur. */
 static double gsdi_blur_tree(const uint32_t *child, const gsdi_sum *sum, const unsigned char *depth, uint32_t count,
                              bool second_moment, gsdi_blur *b)
 {
-    double scale[3] = {0, 0, 0}, low = 0, high = GSDI_BLUR_MOST, total = b->mass[0];
+    double total[3], low = 0, high = GSDI_BLUR_MOST, scale;
     uint32_t i, k;
-    for (k = 0; k < 2; ++k)
-        if (!gsdi_blur_half(child, sum, depth, count, second_moment, k, b->half[k]))
-            return 0;
-    gsdi_blur_near(child, b);
-    for (i = 0; i < count; ++i)
-        for (k = 0; k < 3 && !child[i]; ++k)
-            scale[k] += (double)b->near[k][i];
-    for (k = 0; k < 3; ++k)
-        scale[k] = (k < 2 ? 1 : total) / scale[k];
-    if (gsdi_blur_slope(child, depth, count, b, scale, 0) <= 0)
+    if (!gsdi_blur_masses(child, sum, depth, count, second_moment, b))
+        return 0;
+    gsdi_blur_near(child, b, total);
+    gsdi_blur_moves(child, depth, count, b, total);
+    if (gsdi_blur_slope(count, b, 0) <= 0)
         return 0;
     for (k = 0; k < GSDI_BLUR_STEPS; ++k) {
         double t = 0.5 * (low + high);
-        if (gsdi_blur_slope(child, depth, count, b, scale, t) > 0)
+        if (gsdi_blur_slope(count, b, (float)t) > 0)
             low = t;
         else
             high = t;
@@ -1592,10 +1629,11 @@ static double gsdi_blur_tree(const uint32_t *child, const gsdi_sum *sum, const u
     low = low / (2 - low); /* both halves together have half the noise */
     if (low <= 0)
         return 0;
+    scale = b->mass[0] / total[2];
     for (i = count; i-- > 0;) {
-        double *m = b->mass, near = (double)b->near[2][i] * scale[2];
+        double *m = b->mass;
         uint32_t c = child[i];
-        m[i] = c ? (m[c] + m[c + 1]) + (m[c + 2] + m[c + 3]) : m[i] + low * (near - m[i]);
+        m[i] = c ? (m[c] + m[c + 1]) + (m[c + 2] + m[c + 3]) : m[i] + low * ((double)b->near[2][i] * scale - m[i]);
     }
     return low;
 }
@@ -4216,7 +4254,7 @@ GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
     d.directional_filter = d.directional_filter ? d.directional_filter : GSD_DIRECTIONAL_BOX;
     d.alpha_mode = d.alpha_mode ? d.alpha_mode : GSD_ALPHA_GRID;
     d.denoise = d.denoise ? d.denoise : GSD_DENOISE_BLUR;
-    gsdi_default_float(&d.denoise_budget, 0.25f);
+    gsdi_default_float(&d.denoise_budget, 0.15f);
     gsdi_default_float(&d.switch_after, 4);
     gsdi_default_float(&d.rho, 0.01f);
     gsdi_default_float(&d.gaussian_sigma, 0.8f);

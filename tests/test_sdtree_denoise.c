@@ -115,11 +115,10 @@ static void test_surroundings_match_matrices(void **state)
     for (uint64_t seed = 1; seed <= 60; ++seed) {
         bool second = seed & 1;
         tree *t = make_tree(seed, 1 + seed % 6, seed % 5 == 0 ? -1 : 0.7);
-        double own[MOST], sum[2] = {0, 0};
+        double own[MOST], sum[2] = {0, 0}, total[3];
         measure(t, second);
-        for (uint32_t h = 0; h < 2; ++h)
-            assert_true(gsdi_blur_half(t->child, t->sum, t->depth, t->count, second, h, t->blur.half[h]));
-        gsdi_blur_near(t->child, &t->blur);
+        assert_true(gsdi_blur_masses(t->child, t->sum, t->depth, t->count, second, &t->blur));
+        gsdi_blur_near(t->child, &t->blur, total);
         compare(t, t->mass, t->blur.near[2], 1 / t->mass[0], 0, 0, 0, 0);
         for (uint32_t h = 0; h < 2; ++h) { /* masses of the halves, bottom up */
             for (uint32_t i = t->count; i-- > 0;) {
@@ -136,13 +135,13 @@ static void test_surroundings_match_matrices(void **state)
     }
 }
 
-/* What half h says of the other at t, straight from the definition. */
-static double score(const tree *t, const double *scale, double move)
+/* What either half says of the other at t, straight from the definition; moves are known. */
+static double score(const tree *t, double move)
 {
     double sum = 0;
     for (uint32_t i = 0; i < t->count; ++i)
         for (int h = 0; h < 2 && !t->child[i]; ++h) {
-            double own = (double)t->blur.half[h][i], near = (double)t->blur.near[h][i] * scale[h];
+            double own = (double)t->blur.half[h][i], near = own + (double)t->blur.near[h][i];
             double density =
                 (1 - GSDI_BLUR_EVEN) * ((1 - move) * own + move * near) + GSDI_BLUR_EVEN * pow(0.25, t->depth[i]);
             sum += (double)t->blur.half[1 - h][i] * log(density);
@@ -162,20 +161,14 @@ static void test_strength_is_where_the_halves_agree_best(void **state)
                 t->sum[i].half[k] = pow(t->sum[i].half[0], 1 - (double)(seed % 7) / 6) *
                                     pow(1 + t->sum[i].half[1], (double)(seed % 7) / 6 * (k ? 1 : rnd()));
         measure(t, second);
-        double scale[2] = {0, 0}, best = 0,
-               got = gsdi_blur_tree(t->child, t->sum, t->depth, t->count, second, &t->blur);
-        for (uint32_t i = 0; i < t->count; ++i)
-            for (int h = 0; h < 2 && !t->child[i]; ++h)
-                scale[h] += (double)t->blur.near[h][i];
-        for (int h = 0; h < 2; ++h)
-            scale[h] = 1 / scale[h];
+        double best = 0, got = gsdi_blur_tree(t->child, t->sum, t->depth, t->count, second, &t->blur);
         for (double at = 0.05; at < 0.6; at += 0.1) { /* the slope by finite differences */
-            double slope = gsdi_blur_slope(t->child, t->depth, t->count, &t->blur, scale, at);
-            double finite = (score(t, scale, at + 1e-4) - score(t, scale, at - 1e-4)) / 2e-4;
+            double slope = gsdi_blur_slope(t->count, &t->blur, (float)at);
+            double finite = (score(t, at + 1e-4) - score(t, at - 1e-4)) / 2e-4;
             assert_true(fabs(slope - finite) < 1e-5 + 1e-4 * fabs(finite));
         }
         for (double at = 0; at <= GSDI_BLUR_MOST; at += 0.006)
-            best = score(t, scale, at) > score(t, scale, best) ? at : best;
+            best = score(t, at) > score(t, best) ? at : best;
         double step = GSDI_BLUR_MOST / (1 << GSDI_BLUR_STEPS), half = 2 * got / (1 + got);
         if (!(half <= best + 0.006 && best <= half + step + 0.006))
             fail_msg("seed %d: moved %g, best %g", (int)seed, half, best);
@@ -391,6 +384,7 @@ static size_t saved_box(gsd_denoise_mode mode, gsd_parallel_fn parallel, crowd *
     memset(&d, 0, sizeof d);
     d.denoise = mode;
     d.rho = mode == GSD_DENOISE_GAUSSIAN ? 0.001f : 0;
+    d.denoise_budget = 1000;
     learn_box(&d, 6000, parallel, user, &f);
     gsd_get_stats(f, &stats);
     assert_true(stats.cells > 20 && stats.denoised_trees > stats.cells / 4);
