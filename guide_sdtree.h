@@ -934,6 +934,9 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_ROUND (1u << 18) /* samples sorted at once */
 #define GSDI_SEGMENT 2048u    /* samples prepared at once */
 #define GSDI_STACK 96         /* of a walk through a quadtree: 3 * depth 20 + 4 is the most */
+#define GSDI_MAP_LEVELS 4u    /* of a quadtree that are unfolded for a cell's samples */
+#define GSDI_MAP_FIRST(level) (((1u << 2 * (level)) - 1) / 3)
+#define GSDI_MAP_NODES 341    /* GSDI_MAP_FIRST(GSDI_MAP_LEVELS + 1) */
 #define GSDI_GATE_LOW 4       /* values of a below 1 at which V(a) is estimated */
 #define GSDI_MAX_VALUE 9.9e29 /* radiance or weight from here on is a bad sample */
 #define GSDI_MAX_ROOT 1e15    /* values are clamped to this before squaring */
@@ -1236,103 +1239,109 @@ typedef struct gsdi_visit {
     gsdi_sum sum;
 } gsdi_visit;
 
-/* Leaf of a building tree at 24-bit coordinates; *depth = its depth. */
-static uint32_t gsdi_building_leaf(const uint32_t *child, uint32_t x, uint32_t y, uint32_t *depth)
+/* The first levels of a building tree as pictures, made for the samples of a cell: in that of level l, row
+   y >> (24 - l) and column x >> (24 - l) name the node of depth l there, or the leaf above. */
+typedef struct gsdi_map {
+    const uint32_t *child;
+    gsdi_sum *sum;
+    uint32_t levels;
+    uint32_t node[GSDI_MAP_NODES];
+    unsigned char depth[GSDI_MAP_NODES];
+} gsdi_map;
+
+/* For so many samples: pictures that cost less than they save. */
+static void gsdi_map_make(gsdi_map *map, const uint32_t *child, gsdi_sum *sum, uint32_t samples)
 {
-    uint32_t node = 0, shift = 24;
-    while (child[node]) {
-        --shift;
-        node = child[node] + ((x >> shift) & 1u) + 2 * ((y >> shift) & 1u);
+    uint32_t l, x, y, k;
+    map->child = child;
+    map->sum = sum;
+    map->node[0] = map->depth[0] = 0;
+    for (l = 0; l < GSDI_MAP_LEVELS && (2u << 2 * l) <= samples; ++l) {
+        uint32_t n = 1u << l, at = GSDI_MAP_FIRST(l), to = GSDI_MAP_FIRST(l + 1);
+        for (y = 0; y < n; ++y)
+            for (x = 0; x < n; ++x, ++at) {
+                uint32_t c = child[map->node[at]];
+                for (k = 0; k < 4; ++k) {
+                    uint32_t i = to + (2 * y + (k >> 1)) * 2 * n + 2 * x + (k & 1);
+                    map->node[i] = c ? c + k : map->node[at];
+                    map->depth[i] = (unsigned char)(map->depth[at] + (c != 0));
+                }
+            }
     }
-    *depth = 24 - shift;
+    map->levels = l;
+}
+
+/* Node of this depth at 24-bit coordinates, or the leaf above; *depth becomes its depth. */
+static uint32_t gsdi_map_node(const gsdi_map *map, uint32_t x, uint32_t y, uint32_t *depth)
+{
+    uint32_t level = *depth < map->levels ? *depth : map->levels, shift = 24 - level, c;
+    uint32_t i = GSDI_MAP_FIRST(level) + (y >> shift << level | x >> shift), node = map->node[i];
+    for (level = map->depth[i]; level < *depth && (c = map->child[node]) != 0; ++level) {
+        --shift;
+        node = c + ((x >> shift) & 1u) + 2 * ((y >> shift) & 1u);
+    }
+    *depth = level;
     return node;
 }
 
-/* A square region of a quadtree: node, lowest corner, side. */
-typedef struct gsdi_square {
-    uint32_t node, x, y, size;
-} gsdi_square;
+/* Add weight * (overlap area) to every leaf that overlaps a rectangle. */
+typedef struct gsdi_rectangle {
+    const gsdi_map *map;
+    uint32_t half, x[2], y[2]; /* from, to */
+    double weight;
+} gsdi_rectangle;
 
-/* Add weight * (overlap area) to every leaf below `root` that overlaps [x0, x1) x [y0, y1), which lies within it. */
-static void gsdi_splat_rectangle(const uint32_t *child, gsdi_sum *sum, uint32_t half_of, gsdi_square root,
-                                 const uint32_t x[2], const uint32_t y[2], double weight)
+static uint32_t gsdi_overlap(const uint32_t with[2], uint32_t from, uint32_t size)
 {
-    gsdi_square stack[GSDI_STACK];
-    uint32_t top = 0, k;
-    stack[top++] = root;
-    while (top) {
-        gsdi_square b = stack[--top];
-        uint32_t c = child[b.node], half = b.size >> 1;
-        uint32_t xa = x[0] > b.x ? x[0] : b.x, xb = x[1] < b.x + b.size ? x[1] : b.x + b.size;
-        uint32_t ya = y[0] > b.y ? y[0] : b.y, yb = y[1] < b.y + b.size ? y[1] : b.y + b.size;
-        if (xa >= xb || ya >= yb)
-            continue;
-        if (!c) {
-            sum[b.node].half[half_of] += weight * ((double)(xb - xa) * (double)(yb - ya));
-            continue;
-        }
-        for (k = 4; k-- > 0;) {
-            gsdi_square *s = &stack[top++];
-            s->node = c + k;
-            s->x = b.x + (k & 1) * half;
-            s->y = b.y + (k >> 1) * half;
-            s->size = half;
-        }
+    uint32_t a = with[0] > from ? with[0] : from, b = with[1] < from + size ? with[1] : from + size;
+    return b > a ? b - a : 0;
+}
+
+/* The same within the square of an inner node: lowest corner, side. Leaves beside the rectangle get 0: no branches. */
+static void gsdi_splat_rectangle(const gsdi_rectangle *r, uint32_t node, uint32_t x, uint32_t y, uint32_t size)
+{
+    uint32_t c = r->map->child[node], half = size >> 1, k;
+    for (k = 0; k < 4; ++k) {
+        uint32_t left = x + (k & 1) * half, low = y + (k >> 1) * half;
+        double area = (double)gsdi_overlap(r->x, left, half) * (double)gsdi_overlap(r->y, low, half);
+        if (!r->map->child[c + k])
+            r->map->sum[c + k].half[r->half] += r->weight * area;
+        else if (area > 0)
+            gsdi_splat_rectangle(r, c + k, left, low, half);
     }
 }
 
 /* Box filter [Mueller 2019]: spread value over a box of the size of the leaf at (x, y), centred there. phi wraps; what
    passes a pole comes back at phi + half a turn. The sum over all leaves grows by value. The box overlaps four squares
-   of its own size; each is a leaf, part of a larger one, or divided further. */
-static void gsdi_splat_box(const uint32_t *child, gsdi_sum *sum, uint32_t half, uint32_t x, uint32_t y, double value)
+   of its own size: k = 0 the leaf, 1 beside it, 2 above or below it, 3 beside that one; each of 1 .. 3 is a leaf, part
+   of a larger one, or divided further. */
+static void gsdi_splat_box(const gsdi_map *map, uint32_t half, uint32_t x, uint32_t y, double value)
 {
-    uint32_t depth, leaf = gsdi_building_leaf(child, x, y, &depth);
-    int32_t size = 16777216 >> depth, xs[3], ys[3], i, j;
+    uint32_t depth = 24, leaf = gsdi_map_node(map, x, y, &depth), size = 16777216u >> depth, middle = size / 2, k;
+    uint32_t px = x & (size - 1), right = px >= middle, out_x = right ? px - middle : middle - px;
+    uint32_t py = y & (size - 1), up = py >= middle, out_y = up ? py - middle : middle - py;
+    uint32_t beside = right ? x + size : x - size, above = up ? y + size : y - size, pole = above >> 24 & 1u;
     double weight = value / ((double)size * (double)size);
-    if (depth == 0) {
-        sum[leaf].half[half] += value;
-        return;
-    }
-    xs[0] = (int32_t)x - size / 2;
-    xs[1] = (xs[0] + size - 1) & -size;
-    xs[2] = xs[0] + size;
-    ys[0] = (int32_t)y - size / 2;
-    ys[1] = (ys[0] + size - 1) & -size;
-    ys[2] = ys[0] + size;
-    for (j = 0; j < 2; ++j) {
-        int32_t low = ys[j], height = ys[j + 1] - ys[j], turn = 0;
-        if (low < 0 || low >= 16777216) { /* past a pole */
-            low = low < 0 ? -ys[j + 1] : 33554432 - ys[j + 1];
-            turn = 8388608;
-        }
-        for (i = 0; i < 2; ++i) {
-            uint32_t left = (uint32_t)(xs[i] + turn) & 0xffffffu, bottom = (uint32_t)low, shift = 24, node = 0;
-            int32_t width = xs[i + 1] - xs[i];
-            if (width == 0 || height == 0)
-                continue;
-            if (xs[i] <= (int32_t)x && (int32_t)x < xs[i + 1] && ys[j] <= (int32_t)y && (int32_t)y < ys[j + 1]) {
-                sum[leaf].half[half] += weight * ((double)width * (double)height);
-                continue;
-            }
-            while (child[node] && shift > 24 - depth) {
-                --shift;
-                node = child[node] + ((left >> shift) & 1u) + 2 * ((bottom >> shift) & 1u);
-            }
-            if (child[node]) {
-                gsdi_square root = {0, 0, 0, 0};
-                uint32_t rx[2], ry[2];
-                root.node = node;
-                root.size = (uint32_t)size;
-                root.x = left & ~(root.size - 1);
-                root.y = bottom & ~(root.size - 1);
-                rx[0] = left;
-                rx[1] = left + (uint32_t)width;
-                ry[0] = bottom;
-                ry[1] = bottom + (uint32_t)height;
-                gsdi_splat_rectangle(child, sum, half, root, rx, ry, weight);
-            } else {
-                sum[node].half[half] += weight * ((double)width * (double)height);
-            }
+    above = pole ? y : above;
+    map->sum[leaf].half[half] += weight * ((double)(size - out_x) * (double)(size - out_y));
+    for (k = 1; k < 4; ++k) {
+        uint32_t width = k & 1 ? out_x : size - out_x, height = k & 2 ? out_y : size - out_y, to = depth;
+        uint32_t left = (k & 1 ? beside : x) + (k & 2 ? pole << 23 : 0), low = k & 2 ? above : y;
+        uint32_t node = gsdi_map_node(map, left & 0xffffffu, low, &to);
+        if (map->child[node]) {
+            gsdi_rectangle part;
+            part.map = map;
+            part.half = half;
+            part.weight = weight;
+            left &= 16777215u & ~(size - 1);
+            low &= ~(size - 1);
+            part.x[0] = right == (k & 1) ? left : left + size - width;
+            part.x[1] = part.x[0] + width;
+            part.y[0] = (up ^ (pole & k >> 1)) == k >> 1 ? low : low + size - height;
+            part.y[1] = part.y[0] + height;
+            gsdi_splat_rectangle(&part, node, left, low, size);
+        } else {
+            map->sum[node].half[half] += weight * ((double)width * (double)height);
         }
     }
 }
@@ -1784,18 +1793,24 @@ static void gsdi_learn(const gsdi_accumulation *a, gsdi_state *state, const gsd_
     item->pixel = (float)(value < 1e30 ? value : 1e30);
 }
 
-static void gsdi_splat(const gsdi_accumulation *a, uint32_t cell, const gsdi_item *item)
+static void gsdi_cell_map(const gsdi_accumulation *a, uint32_t cell, gsdi_map *map)
 {
-    const gsdi_state *state = &a->field->states[cell];
-    const uint32_t *child = a->field->child + state->first;
-    gsdi_sum *sum = a->field->sum + state->first;
-    uint32_t x = item->x & 0xffffffu, y = item->y, half = (x ^ y) & 1u, depth;
+    uint32_t first = a->field->states[cell].first;
+    gsdi_map_make(map, a->field->child + first, a->field->sum + first, a->start[cell + 1] - a->start[cell]);
+}
+
+/* Add an item to the quadtree. */
+static void gsdi_splat(const gsdi_accumulation *a, const gsdi_map *map, gsdi_state *state, const gsdi_item *item)
+{
+    uint32_t x = item->x & 0xffffffu, y = item->y, half = (x ^ y) & 1u, depth = 24;
+    state->held += 1; /* one by one: sums that refine has scaled round alike for any cut */
     if (!(item->pixel > 0))
         return;
+    state->lit += 1;
     if (a->box)
-        gsdi_splat_box(child, sum, half, x, y, (double)item->pixel);
+        gsdi_splat_box(map, half, x, y, (double)item->pixel);
     else
-        sum[gsdi_building_leaf(child, x, y, &depth)].half[half] += (double)item->pixel;
+        map->sum[gsdi_map_node(map, x, y, &depth)].half[half] += (double)item->pixel;
 }
 
 /* Busy cells [begin, end): statistics, and the quadtree sums where both belong to the same cell. */
@@ -1807,16 +1822,16 @@ static void gsdi_learn_cells(void *context, uint32_t begin, uint32_t end)
         uint32_t cell = a->busy[b], stop = a->start[cell + 1];
         gsd_handle handle = gsd_find_cell(&a->view, cell);
         gsdi_state *state = &a->field->states[cell];
+        gsdi_map map;
+        if (!a->stochastic)
+            gsdi_cell_map(a, cell, &map);
         for (i = a->start[cell]; i < stop; ++i) {
             gsdi_item *item = &a->items[a->order[i]];
             if (i + 8 < stop)
                 GSDI_PREFETCH(&a->items[a->order[i + 8]]);
             gsdi_learn(a, state, &handle, item);
-            if (!a->stochastic) {
-                state->held += 1;
-                state->lit += item->pixel > 0;
-                gsdi_splat(a, cell, item);
-            }
+            if (!a->stochastic)
+                gsdi_splat(a, &map, state, item);
         }
     }
 }
@@ -1828,11 +1843,10 @@ static void gsdi_splat_cells(void *context, uint32_t begin, uint32_t end)
     uint32_t b, i;
     for (b = begin; b < end; ++b) {
         uint32_t cell = a->busy[b];
-        for (i = a->start[cell]; i < a->start[cell + 1]; ++i) {
-            a->field->states[cell].held += 1; /* one by one: sums that refine has scaled round alike for any cut */
-            a->field->states[cell].lit += a->items[a->order[i]].pixel > 0;
-            gsdi_splat(a, cell, &a->items[a->order[i]]);
-        }
+        gsdi_map map;
+        gsdi_cell_map(a, cell, &map);
+        for (i = a->start[cell]; i < a->start[cell + 1]; ++i)
+            gsdi_splat(a, &map, &a->field->states[cell], &a->items[a->order[i]]);
     }
 }
 
