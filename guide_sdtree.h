@@ -935,8 +935,8 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_SEGMENT 2048u    /* samples prepared at once */
 #define GSDI_STACK 96         /* of a walk through a quadtree: 3 * depth 20 + 4 is the most */
 #define GSDI_MAP_LEVELS 4u    /* of a quadtree that are unfolded for a cell's samples */
-#define GSDI_MAP_FIRST(level) (((1u << 2 * (level)) - 1) / 3)
-#define GSDI_MAP_NODES 341    /* GSDI_MAP_FIRST(GSDI_MAP_LEVELS + 1) */
+#define GSDI_MAP_FIRST(level) (((1u << 2 * (level)) - 1) & 0x55555555u) /* (4^level - 1) / 3 */
+#define GSDI_MAP_NODES 341                                              /* GSDI_MAP_FIRST(GSDI_MAP_LEVELS + 1) */
 #define GSDI_GATE_LOW 4       /* values of a below 1 at which V(a) is estimated */
 #define GSDI_MAX_VALUE 9.9e29 /* radiance or weight from here on is a bad sample */
 #define GSDI_MAX_ROOT 1e15    /* values are clamped to this before squaring */
@@ -1311,37 +1311,54 @@ static void gsdi_splat_rectangle(const gsdi_rectangle *r, uint32_t node, uint32_
     }
 }
 
+/* Where a box of this side, centred at x, lies: in the square of its size around x [0] and in the one beside it [1],
+   above if upper, else below. at: a coordinate in each. Without branches: either is as likely. */
+typedef struct gsdi_sides {
+    uint32_t upper, at[2], length[2];
+} gsdi_sides;
+
+static gsdi_sides gsdi_box_sides(uint32_t x, uint32_t size)
+{
+    gsdi_sides s;
+    uint32_t middle = size / 2, sign;
+    s.upper = (x & middle) != 0;
+    sign = s.upper - 1; /* all bits set: below */
+    s.at[0] = x;
+    s.at[1] = x + ((size ^ sign) - sign);
+    s.length[1] = (((x & (size - 1)) - middle) ^ sign) - sign;
+    s.length[0] = size - s.length[1];
+    return s;
+}
+
 /* Box filter [Mueller 2019]: spread value over a box of the size of the leaf at (x, y), centred there. phi wraps; what
    passes a pole comes back at phi + half a turn. The sum over all leaves grows by value. The box overlaps four squares
    of its own size: k = 0 the leaf, 1 beside it, 2 above or below it, 3 beside that one; each of 1 .. 3 is a leaf, part
    of a larger one, or divided further. */
 static void gsdi_splat_box(const gsdi_map *map, uint32_t half, uint32_t x, uint32_t y, double value)
 {
-    uint32_t depth = 24, leaf = gsdi_map_node(map, x, y, &depth), size = 16777216u >> depth, middle = size / 2, k;
-    uint32_t px = x & (size - 1), right = px >= middle, out_x = right ? px - middle : middle - px;
-    uint32_t py = y & (size - 1), up = py >= middle, out_y = up ? py - middle : middle - py;
-    uint32_t beside = right ? x + size : x - size, above = up ? y + size : y - size, pole = above >> 24 & 1u;
+    uint32_t depth = 24, leaf = gsdi_map_node(map, x, y, &depth), size = 16777216u >> depth, k;
+    gsdi_sides h = gsdi_box_sides(x, size), v = gsdi_box_sides(y, size);
+    uint32_t pole = v.at[1] >> 24 & 1u;
     double weight = value / ((double)size * (double)size);
-    above = pole ? y : above;
-    map->sum[leaf].half[half] += weight * ((double)(size - out_x) * (double)(size - out_y));
+    v.at[1] = pole ? y : v.at[1];
+    map->sum[leaf].half[half] += weight * ((double)h.length[0] * (double)v.length[0]);
     for (k = 1; k < 4; ++k) {
-        uint32_t width = k & 1 ? out_x : size - out_x, height = k & 2 ? out_y : size - out_y, to = depth;
-        uint32_t left = (k & 1 ? beside : x) + (k & 2 ? pole << 23 : 0), low = k & 2 ? above : y;
-        uint32_t node = gsdi_map_node(map, left & 0xffffffu, low, &to);
+        uint32_t i = k & 1, j = k >> 1, left = (h.at[i] + (j & pole) * 8388608u) & 0xffffffu, low = v.at[j], to = depth;
+        uint32_t node = gsdi_map_node(map, left, low, &to);
         if (map->child[node]) {
             gsdi_rectangle part;
             part.map = map;
             part.half = half;
             part.weight = weight;
-            left &= 16777215u & ~(size - 1);
+            left &= ~(size - 1);
             low &= ~(size - 1);
-            part.x[0] = right == (k & 1) ? left : left + size - width;
-            part.x[1] = part.x[0] + width;
-            part.y[0] = (up ^ (pole & k >> 1)) == k >> 1 ? low : low + size - height;
-            part.y[1] = part.y[0] + height;
+            part.x[0] = left + (h.upper == i ? 0 : size - h.length[i]);
+            part.x[1] = part.x[0] + h.length[i];
+            part.y[0] = low + ((v.upper ^ (j & pole)) == j ? 0 : size - v.length[j]);
+            part.y[1] = part.y[0] + v.length[j];
             gsdi_splat_rectangle(&part, node, left, low, size);
         } else {
-            map->sum[node].half[half] += weight * ((double)width * (double)height);
+            map->sum[node].half[half] += weight * ((double)h.length[i] * (double)v.length[j]);
         }
     }
 }
@@ -1817,7 +1834,7 @@ static void gsdi_splat(const gsdi_accumulation *a, const gsdi_map *map, gsdi_sta
 static void gsdi_learn_cells(void *context, uint32_t begin, uint32_t end)
 {
     gsdi_accumulation *a = (gsdi_accumulation *)context;
-    uint32_t b, i;
+    uint32_t b, i, last = a->start[a->view.cell_count];
     for (b = begin; b < end; ++b) {
         uint32_t cell = a->busy[b], stop = a->start[cell + 1];
         gsd_handle handle = gsd_find_cell(&a->view, cell);
@@ -1827,8 +1844,10 @@ static void gsdi_learn_cells(void *context, uint32_t begin, uint32_t end)
             gsdi_cell_map(a, cell, &map);
         for (i = a->start[cell]; i < stop; ++i) {
             gsdi_item *item = &a->items[a->order[i]];
-            if (i + 8 < stop)
-                GSDI_PREFETCH(&a->items[a->order[i + 8]]);
+            if (i + 8 < last) {
+                GSDI_PREFETCH(&a->items[a->order[i + 8]].x);
+                GSDI_PREFETCH(&a->items[a->order[i + 8]].normal); /* may lie in the next cache line */
+            }
             gsdi_learn(a, state, &handle, item);
             if (!a->stochastic)
                 gsdi_splat(a, &map, state, item);
