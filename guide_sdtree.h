@@ -937,10 +937,10 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_MAP_LEVELS 4u    /* of a quadtree that are unfolded for a cell's samples */
 #define GSDI_MAP_FIRST(level) (((1u << 2 * (level)) - 1) & 0x55555555u) /* (4^level - 1) / 3 */
 #define GSDI_MAP_NODES 341                                              /* GSDI_MAP_FIRST(GSDI_MAP_LEVELS + 1) */
-#define GSDI_GATE_LOW 4       /* values of a below 1 at which V(a) is estimated */
-#define GSDI_MAX_VALUE 9.9e29 /* radiance or weight from here on is a bad sample */
-#define GSDI_MAX_ROOT 1e15    /* values are clamped to this before squaring */
-#define GSDI_CONFIDENCE 1.645 /* one-sided 95 % of the normal distribution */
+#define GSDI_GATE_LOW 4        /* values of a below 1 at which V(a) is estimated */
+#define GSDI_MAX_VALUE 9.9e29f /* radiance or weight from here on is a bad sample */
+#define GSDI_MAX_ROOT 1e15     /* values are clamped to this before squaring */
+#define GSDI_CONFIDENCE 1.645  /* one-sided 95 % of the normal distribution */
 #define GSDI_MIN_EFFECTIVE                                                                                             \
     128.0                         /* effective non-zero samples for the verdict "this tree does not pay"; fewer closes \
                                      cells whose light is rarely found */
@@ -1625,12 +1625,11 @@ typedef struct gsdi_accumulation {
 /* False where a sample is bad: not finite, negative, out of range, no density. */
 static bool gsdi_sample_valid(const gsd_training_sample *s)
 {
-    return s->radiance >= 0 && (double)s->radiance < GSDI_MAX_VALUE && s->contribution >= 0 &&
-           (double)s->contribution < GSDI_MAX_VALUE && s->pixel_contribution >= 0 &&
-           (double)s->pixel_contribution < GSDI_MAX_VALUE && s->pdf_mix > 0 && gsdi_finite(s->pdf_mix) &&
-           s->pdf_bsdf >= 0 && gsdi_finite(s->pdf_bsdf) && s->pdf_guide >= 0 && gsdi_finite(s->pdf_guide) &&
-           (double)s->radiance < GSDI_MAX_VALUE * (double)s->pdf_mix &&
-           gsdi_finite(s->position[0] + s->position[1] + s->position[2]);
+    const float most = GSDI_MAX_VALUE, finite = 3.4028234e38f;
+    return s->radiance >= 0 && s->radiance < most && s->contribution >= 0 && s->contribution < most &&
+           s->pixel_contribution >= 0 && s->pixel_contribution < most && s->pdf_mix > 0 && s->pdf_mix <= finite &&
+           s->pdf_bsdf >= 0 && s->pdf_bsdf <= finite && s->pdf_guide >= 0 && s->pdf_guide <= finite &&
+           s->radiance < most * s->pdf_mix && gsdi_finite(s->position[0] + s->position[1] + s->position[2]);
 }
 
 /* Cells of a sample: where it lies and where it is added. Sets the item's bin. False: no such cell. */
@@ -1638,8 +1637,7 @@ static bool gsdi_locate(gsdi_accumulation *a, const gsd_training_sample *s, uint
                         gsdi_segment *segment)
 {
     const gsd_view *view = &a->view;
-    uint32_t g[3], cell, axis, bin = 0;
-    const gsdi_state *state;
+    uint32_t g[3], cell, level, axis, bin = 0;
     bool outside = false;
     if (a->field->desc.forest_cells) {
         memcpy(&cell, s->position, sizeof cell);
@@ -1654,16 +1652,15 @@ static bool gsdi_locate(gsdi_accumulation *a, const gsd_training_sample *s, uint
     segment->clamped += outside;
     cell = gsd_cell_at(view, g);
     a->read_cell[at] = a->target_cell[at] = cell;
-    state = &a->field->states[cell];
-    for (axis = 0; axis < 3; ++axis) {
-        bin = bin << 2 | ((g[axis] >> (22 - (state->level + 2 - axis) / 3)) & 3u);
-    }
+    level = view->cells[cell].level;
+    for (axis = 0; axis < 3; ++axis)
+        bin = bin << 2 | ((g[axis] >> (22 - (level + 2 - axis) / 3)) & 3u);
     item->x |= bin << 24;
     if (a->stochastic) {
         double u[3];
         gsdi_sample_random(s, u);
         for (axis = 0; axis < 3; ++axis) {
-            double t = (double)g[axis] + (u[axis] - 0.5) * (double)gsd_cell_extent(state->level, axis);
+            double t = (double)g[axis] + (u[axis] - 0.5) * (double)gsd_cell_extent(level, axis);
             g[axis] = t <= 0 ? 0 : t < 16777215.0 ? (uint32_t)t : 16777215u;
         }
         a->target_cell[at] = gsd_cell_at(view, g);
