@@ -1340,10 +1340,11 @@ static void gsdi_splat_box(const gsdi_map *map, uint32_t half, uint32_t x, uint3
     gsdi_sides h = gsdi_box_sides(x, size), v = gsdi_box_sides(y, size);
     uint32_t pole = v.at[1] >> 24 & 1u;
     double weight = value / ((double)size * (double)size);
+    h.at[1] &= 0xffffffu;
     v.at[1] = pole ? y : v.at[1];
     map->sum[leaf].half[half] += weight * ((double)h.length[0] * (double)v.length[0]);
     for (k = 1; k < 4; ++k) {
-        uint32_t i = k & 1, j = k >> 1, left = (h.at[i] + (j & pole) * 8388608u) & 0xffffffu, low = v.at[j], to = depth;
+        uint32_t i = k & 1, j = k >> 1, left = h.at[i] ^ (j & pole) << 23, low = v.at[j], to = depth;
         uint32_t node = gsdi_map_node(map, left, low, &to);
         if (map->child[node]) {
             gsdi_rectangle part;
@@ -2275,7 +2276,7 @@ static void gsdi_tree_aliases(gsdi_block *b, const gsdi_tree *tree)
     uint32_t n = 0, i, small = GSDI_NONE, large = GSDI_NONE, current = GSDI_NONE;
     for (i = tree->first; i < tree->first + tree->groups * 4; ++i) {
         const gsd_node *node = &nodes[i];
-        double area = 12.566370614359172 / pow(4, (double)(node->leaf.x >> 24)), mass;
+        double area = 12.566370614359172 / (double)((uint64_t)1 << (2 * (node->leaf.x >> 24))), mass;
         if (node->leaf.child)
             continue;
         mass = ((double)node->leaf.pdf - e * (double)GSD_INV_4PI) / (1 - e) * area * (double)tree->leaves;
@@ -2342,7 +2343,7 @@ static void gsdi_tree_write(gsdi_block *b, gsdi_tree *tree, const uint32_t *chil
             out->leaf.x = o.x | o.depth << 24;
             out->leaf.y = o.y;
             tree->max_depth = o.depth > tree->max_depth ? o.depth : tree->max_depth;
-            mean += (double)o.depth * o.pdf * 12.566370614359172 / pow(4, (double)o.depth);
+            mean += (double)o.depth * o.pdf * 12.566370614359172 / (double)((uint64_t)1 << (2 * o.depth));
             continue;
         }
         for (k = 0; k < 4; ++k)
