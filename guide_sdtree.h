@@ -3420,7 +3420,7 @@ GSD_API gsd_result gsd_forest_split(gsd_field *field, uint32_t parent, uint32_t 
 
 /* ---- >>batches ---------------------------------------------------------------------------------------------- */
 
-#define GSDI_LANES 16u /* queries in flight: enough to cover the latency of memory */
+#define GSDI_LANES 64u /* queries in flight; 16 and 32 wait for memory longer */
 
 static uint32_t gsdi_at(const uint32_t *index, uint32_t i) { return index ? index[i] : i; }
 static const float *gsdi_row(const float *base, size_t stride, uint32_t row)
@@ -3533,7 +3533,7 @@ GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t
     }
 }
 
-/* Descend up to 16 trees together, one level of each in turn; node[i] ends at a leaf. */
+/* Descend up to 64 trees together, one level of each in turn; node[i] ends at a leaf. */
 static void gsdi_descend(const gsd_view *view, uint32_t n, uint32_t *node, uint32_t (*xy)[2], uint32_t *shift)
 {
     uint32_t lane[GSDI_LANES], active = n, i;
@@ -3593,7 +3593,7 @@ typedef struct gsdi_draw {
     uint32_t node;
 } gsdi_draw;
 
-/* Follow the inverse distribution of up to 16 draws to leaves, one level of each in turn; see gsd_sample. */
+/* Follow the inverse distribution of up to 64 draws to leaves, one level of each in turn; see gsd_sample. */
 static void gsdi_draw_descend(const gsd_view *view, uint32_t n, gsdi_draw *draws, const bool *tree)
 {
     uint32_t lane[GSDI_LANES], active = 0, i;
@@ -3671,7 +3671,8 @@ static void gsdi_draw_alias(const gsd_view *view, gsdi_draw *d)
 }
 
 #if GSDI_X86
-/* Sixteen draws as arrays. The steps are those of gsd_sample, in the same operations, so results are equal bit by bit.
+/* Draws as arrays, in groups of eight. The steps are those of gsd_sample, in the same operations, so results are equal
+ * bit by bit.
  */
 typedef struct gsdi_draws {
     double r[2][GSDI_LANES], lo[2][GSDI_LANES], width[2][GSDI_LANES];
@@ -3690,11 +3691,11 @@ GSDI_AVX2 static __m256d gsdi_u32_double(__m128i x)
 }
 
 /* gsd_extend_random, then r[0] without the uniform share. */
-GSDI_AVX2 static void gsdi_extend_avx2(gsdi_draws *d, double e)
+GSDI_AVX2 static void gsdi_extend_avx2(gsdi_draws *d, uint32_t lanes, double e)
 {
     __m256d scale = _mm256_set1_pd(2.3283064365386963e-10);
     uint32_t i;
-    for (i = 0; i < GSDI_LANES; i += 4) {
+    for (i = 0; i < lanes; i += 4) {
         __m128i a = _mm_loadu_si128((const __m128i *)(const void *)&d->bits[0][i]);
         __m128i b = _mm_loadu_si128((const __m128i *)(const void *)&d->bits[1][i]), h, low = _mm_set1_epi32(255);
         h = _mm_xor_si128(
@@ -3751,13 +3752,13 @@ GSDI_AVX2 static __m128i gsdi_mask_avx2(__m256d mask)
 }
 
 /* One level down for eight lanes; false when all are at leaves. */
-GSDI_AVX2 static bool gsdi_step_avx2(const gsd_view *view, gsdi_draws *d, uint32_t lane)
+GSDI_AVX2 static bool gsdi_step_avx2(const gsd_node *nodes, gsdi_draws *d, uint32_t lane)
 {
     __m256 column[4];
     __m256i child, active, next;
     __m128i bx[2], by[2];
     uint32_t half, i;
-    gsdi_nodes_avx2(view->nodes, &d->node[lane], column);
+    gsdi_nodes_avx2(nodes, &d->node[lane], column);
     child = _mm256_castps_si256(column[0]);
     active = _mm256_xor_si256(_mm256_cmpeq_epi32(child, _mm256_setzero_si256()), _mm256_set1_epi32(-1));
     if (_mm256_testz_si256(active, active))
@@ -3780,16 +3781,16 @@ GSDI_AVX2 static bool gsdi_step_avx2(const gsd_view *view, gsdi_draws *d, uint32
     next = _mm256_blendv_epi8(_mm256_loadu_si256((const __m256i *)(const void *)&d->node[lane]), next, active);
     _mm256_storeu_si256((__m256i *)(void *)&d->node[lane], next);
     for (i = 0; i < 8; ++i)
-        GSDI_PREFETCH(&view->nodes[d->node[lane + i]]);
+        GSDI_PREFETCH(&nodes[d->node[lane + i]]);
     return true;
 }
 
 /* Places in the leaves: coordinates r in units of 2^-24, whether near the edge, pdf. */
-GSDI_AVX2 static void gsdi_leaves_avx2(const gsd_view *view, gsdi_draws *d, uint32_t lane)
+GSDI_AVX2 static void gsdi_leaves_avx2(const gsd_node *nodes, gsdi_draws *d, uint32_t lane)
 {
     __m256 column[4];
     uint32_t half, k;
-    gsdi_nodes_avx2(view->nodes, &d->node[lane], column);
+    gsdi_nodes_avx2(nodes, &d->node[lane], column);
     _mm256_storeu_ps(&d->pdf[lane], column[1]);
     for (half = 0; half < 2; ++half) {
         uint32_t at = lane + half * 4;
@@ -3855,16 +3856,16 @@ GSDI_AVX2 static void gsdi_directions_avx2(gsdi_draws *d, uint32_t lane)
 
 static bool gsdi_aliased(const gsd_handle *h) { return h->alias_count && !(h->product > 0); }
 
-/* Up to 16 draws. Those of the uniform share, and what has no alias table in a field of them, are done one by one. */
+/* Up to 64 draws. Those of the uniform share, and what has no alias table in a field of them, are done one by one. */
 GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const uint32_t *at, const gsd_handle *handles,
                                        const float *u, size_t u_stride, float *directions, size_t direction_stride,
                                        float *pdf)
 {
     gsdi_draws d;
     double e = (double)view->uniform;
-    bool aliased = gsdi_aliased(&handles[at[0]]), go[2] = {!aliased, !aliased};
-    uint32_t i, k;
-    for (i = 0; i < GSDI_LANES; ++i) {
+    bool aliased = gsdi_aliased(&handles[at[0]]), done[GSDI_LANES / 8];
+    uint32_t lanes = (n + 7) & ~7u, left = aliased ? 0 : lanes, i, k; /* those from n on repeat the first */
+    for (i = 0; i < lanes; ++i) {
         const float *v = gsdi_row(u, u_stride, at[i < n ? i : 0]);
         for (k = 0; k < 2; ++k) {
             int32_t b = (int32_t)(v[k] * 16777216.0f);
@@ -3872,10 +3873,11 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
             d.lo[k][i] = 0;
             d.width[k][i] = 1;
         }
+        done[i / 8] = false;
         d.node[i] = handles[at[i < n ? i : 0]].root;
         GSDI_PREFETCH(&view->nodes[d.node[i]]);
     }
-    gsdi_extend_avx2(&d, e);
+    gsdi_extend_avx2(&d, lanes, e);
     for (i = 0; !aliased && i < n; ++i) {
         const gsd_handle *h = &handles[at[i]];
         float weight[GSDI_BINS], row[8];
@@ -3890,7 +3892,7 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
         d.r[1][i] = r[1];
         GSDI_PREFETCH(&view->nodes[d.node[i]]);
     }
-    for (i = 0; aliased && i < GSDI_LANES; ++i) {
+    for (i = 0; aliased && i < lanes; ++i) {
         const gsd_handle *h = &handles[at[i < n ? i : 0]];
         double slot = d.r[0][i] * (double)h->alias_count;
         slot = slot > 0 ? slot : 0; /* the uniform share comes later */
@@ -3898,25 +3900,23 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
         d.r[0][i] = slot - (double)(int64_t)slot;
         GSDI_PREFETCH(&view->aliases[d.node[i]]);
     }
-    for (i = 0; aliased && i < GSDI_LANES; ++i) {
+    for (i = 0; aliased && i < lanes; ++i) { /* without branches: either leaf may be the one */
         const gsd_alias *a = &view->aliases[d.node[i]];
-        double t = (double)a->threshold;
-        bool own = d.r[0][i] < t;
-        if (!gsdi_aliased(&handles[at[i < n ? i : 0]]))
-            continue;
-        d.lo[0][i] = own ? 0 : t;
-        d.width[0][i] = own ? t : 1 - t;
-        d.node[i] = own ? a->node : a->other;
+        uint32_t other = !(d.r[0][i] < (double)a->threshold);
+        d.lo[0][i] = (double)other * (double)a->threshold;
+        d.width[0][i] = fabs((double)other - (double)a->threshold);
+        d.node[i] = a->node ^ ((a->node ^ a->other) & (0 - other));
+        d.node[i] = gsdi_aliased(&handles[at[i < n ? i : 0]]) ? d.node[i] : 0;
         GSDI_PREFETCH(&view->nodes[d.node[i]]);
     }
-    for (i = 0; aliased && i < GSDI_LANES; ++i)
-        d.node[i] = gsdi_aliased(&handles[at[i < n ? i : 0]]) ? d.node[i] : 0;
-    while (go[0] || go[1]) {
-        go[0] = go[0] && gsdi_step_avx2(view, &d, 0);
-        go[1] = go[1] && gsdi_step_avx2(view, &d, 8);
-    }
-    for (i = 0; i < GSDI_LANES; i += 8) {
-        gsdi_leaves_avx2(view, &d, i);
+    while (left)
+        for (i = 0; i < lanes; i += 8)
+            if (!done[i / 8] && !gsdi_step_avx2(view->nodes, &d, i)) {
+                done[i / 8] = true;
+                left -= 8;
+            }
+    for (i = 0; i < lanes; i += 8) {
+        gsdi_leaves_avx2(view->nodes, &d, i);
         gsdi_directions_avx2(&d, i);
     }
     for (i = 0; i < n; ++i) {
