@@ -722,19 +722,23 @@ GSD_QUERY uint32_t gsd_choose_of_eight(const float *weight, double *r)
 }
 
 /* First step of sampling a product: choose a row of bins by r[1], a bin in it by r[0], which become the place in the
-   node that the bin's jump leads to. weight, row: from gsd_bin_weights. */
-GSD_QUERY uint32_t gsd_choose_bin(const gsd_view *view, const gsd_handle *handle, const float *weight, const float *row,
-                                  double r[2])
+   bin. weight, row: from gsd_bin_weights. */
+GSD_QUERY uint32_t gsd_choose_bin(const float *weight, const float *row, double r[2])
 {
-    uint32_t y = gsd_choose_of_eight(row, &r[1]), x = gsd_choose_of_eight(weight + y * 8, &r[0]);
-    uint32_t node = view->jumps[handle->jump + y * 8 + x], depth, mask;
-    if (view->nodes[node].leaf.child == 0 && (depth = view->nodes[node].leaf.x >> 24) < 3) { /* the bin is a part */
+    uint32_t y = gsd_choose_of_eight(row, &r[1]);
+    return y * 8 + gsd_choose_of_eight(weight + y * 8, &r[0]);
+}
+
+/* The place in a bin becomes that in the node its jump leads to: the same, unless that is a leaf of several bins. */
+GSD_QUERY void gsd_leave_bin(const gsd_node *node, uint32_t bin, double r[2])
+{
+    uint32_t depth = node->leaf.x >> 24, mask;
+    if (node->leaf.child == 0 && depth < 3) {
         double part = 1.0 / (double)(8u >> depth);
         mask = (8u >> depth) - 1;
-        r[0] = ((double)(x & mask) + r[0]) * part;
-        r[1] = ((double)(y & mask) + r[1]) * part;
+        r[0] = ((double)(bin & mask) + r[0]) * part;
+        r[1] = ((double)(bin >> 3 & mask) + r[1]) * part;
     }
-    return node;
 }
 
 /* Probabilities of the bins under the product, and the sums of the 8 rows. */
@@ -765,8 +769,11 @@ GSD_QUERY float gsd_sample(const gsd_view *view, const gsd_handle *handle, const
     r[0] = r[0] < 0.99999999988 ? r[0] : 0.99999999988;
     if (handle->product > 0) {
         float weight[64], row[8];
+        uint32_t bin;
         gsd_bin_weights(view, handle, weight, row);
-        node = gsd_choose_bin(view, handle, weight, row, r);
+        bin = gsd_choose_bin(weight, row, r);
+        node = view->jumps[handle->jump + bin];
+        gsd_leave_bin(&view->nodes[node], bin, r);
     } else if (handle->alias_count) {
         double slot = r[0] * (double)handle->alias_count;
         const gsd_alias *a = &view->aliases[handle->alias + (uint32_t)slot];
@@ -3590,7 +3597,7 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 /* State of one sampling query. */
 typedef struct gsdi_draw {
     double r[2], lo[2], width[2];
-    uint32_t node;
+    uint32_t node, bin;
 } gsdi_draw;
 
 /* Follow the inverse distribution of up to 64 draws to leaves, one level of each in turn; see gsd_sample. */
@@ -3630,7 +3637,8 @@ static void gsdi_draw_descend(const gsd_view *view, uint32_t n, gsdi_draw *draws
         }
 }
 
-/* Start one draw: 0 = uniform share (r is the place on the sphere), 1 = descend, 2 = alias slot in node. */
+/* Start one draw: 0 = uniform share (r is the place on the sphere), 1 = descend, 2 = alias slot in node, 3 = jump of a
+   bin in node. */
 static int gsdi_draw_start(const gsd_view *view, const gsd_handle *h, const float *u, gsdi_draw *d)
 {
     double e = (double)view->uniform;
@@ -3647,7 +3655,10 @@ static int gsdi_draw_start(const gsd_view *view, const gsd_handle *h, const floa
     if (h->product > 0) {
         float weight[GSDI_BINS], row[8];
         gsd_bin_weights(view, h, weight, row);
-        d->node = gsd_choose_bin(view, h, weight, row, d->r);
+        d->bin = gsd_choose_bin(weight, row, d->r);
+        d->node = h->jump + d->bin;
+        GSDI_PREFETCH(&view->jumps[d->node]);
+        return 3;
     } else if (h->alias_count) {
         double slot = d->r[0] * (double)h->alias_count;
         d->node = h->alias + (uint32_t)slot;
@@ -3676,7 +3687,7 @@ static void gsdi_draw_alias(const gsd_view *view, gsdi_draw *d)
  */
 typedef struct gsdi_draws {
     double r[2][GSDI_LANES], lo[2][GSDI_LANES], width[2][GSDI_LANES];
-    uint32_t bits[2][GSDI_LANES]; /* of u, 24 each; then extended to 32 */
+    uint32_t bits[2][GSDI_LANES]; /* of u, 24 each; then [1]: the bin of a product */
     uint32_t node[GSDI_LANES];
     float out[3][GSDI_LANES], pdf[GSDI_LANES];
     uint32_t edge[GSDI_LANES]; /* not 0: near the leaf's edge */
@@ -3878,7 +3889,7 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
         GSDI_PREFETCH(&view->nodes[d.node[i]]);
     }
     gsdi_extend_avx2(&d, lanes, e);
-    for (i = 0; !aliased && i < n; ++i) {
+    for (i = 0; !aliased && i < n; ++i) { /* the steps of gsd_choose_bin and gsd_leave_bin, with a prefetch between */
         const gsd_handle *h = &handles[at[i]];
         float weight[GSDI_BINS], row[8];
         double r[2];
@@ -3887,11 +3898,23 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
         gsdi_bin_weights_avx2(view, h, weight, row);
         r[0] = d.r[0][i] > 0 ? d.r[0][i] : 0; /* the uniform share comes later */
         r[1] = d.r[1][i];
-        d.node[i] = gsd_choose_bin(view, h, weight, row, r);
+        d.bits[1][i] = gsd_choose_bin(weight, row, r);
         d.r[0][i] = r[0];
         d.r[1][i] = r[1];
-        GSDI_PREFETCH(&view->nodes[d.node[i]]);
+        GSDI_PREFETCH(&view->jumps[h->jump + d.bits[1][i]]);
     }
+    for (i = 0; !aliased && i < n; ++i)
+        if (handles[at[i]].product > 0) {
+            d.node[i] = view->jumps[handles[at[i]].jump + d.bits[1][i]];
+            GSDI_PREFETCH(&view->nodes[d.node[i]]);
+        }
+    for (i = 0; !aliased && i < n; ++i)
+        if (handles[at[i]].product > 0) {
+            double r[2] = {d.r[0][i], d.r[1][i]};
+            gsd_leave_bin(&view->nodes[d.node[i]], d.bits[1][i], r);
+            d.r[0][i] = r[0];
+            d.r[1][i] = r[1];
+        }
     for (i = 0; aliased && i < lanes; ++i) {
         const gsd_handle *h = &handles[at[i < n ? i : 0]];
         double slot = d.r[0][i] * (double)h->alias_count;
@@ -3957,11 +3980,18 @@ GSD_API void gsd_sample_batch(const gsd_view *view, uint32_t count, const uint32
         for (i = 0; i < n; ++i) {
             uint32_t at = gsdi_at(index, start + i);
             kind[i] = gsdi_draw_start(view, &handles[at], gsdi_row(u, u_stride, at), &draws[i]);
-            tree[i] = kind[i] == 1;
+            tree[i] = kind[i] & 1;
         }
         for (i = 0; i < n; ++i)
-            if (kind[i] == 2)
+            if (kind[i] == 2) {
                 gsdi_draw_alias(view, &draws[i]);
+            } else if (kind[i] == 3) {
+                draws[i].node = view->jumps[draws[i].node];
+                GSDI_PREFETCH(&view->nodes[draws[i].node]);
+            }
+        for (i = 0; i < n; ++i)
+            if (kind[i] == 3)
+                gsd_leave_bin(&view->nodes[draws[i].node], draws[i].bin, draws[i].r);
         gsdi_draw_descend(view, n, draws, tree);
         for (i = 0; i < n; ++i) {
             uint32_t at = gsdi_at(index, start + i);
