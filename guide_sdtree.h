@@ -2283,9 +2283,10 @@ static void gsdi_tree_aliases(gsdi_block *b, const gsdi_tree *tree)
     uint32_t n = 0, i, small = GSDI_NONE, large = GSDI_NONE, current = GSDI_NONE;
     for (i = tree->first; i < tree->first + tree->groups * 4; ++i) {
         const gsd_node *node = &nodes[i];
-        double area = 12.566370614359172 / (double)((uint64_t)1 << (2 * (node->leaf.x >> 24))), mass;
+        double area, mass;
         if (node->leaf.child)
             continue;
+        area = 12.566370614359172 / (double)((uint64_t)1 << (2 * (node->leaf.x >> 24)));
         mass = ((double)node->leaf.pdf - e * (double)GSD_INV_4PI) / (1 - e) * area * (double)tree->leaves;
         slots[n].node = i;
         slots[n].threshold = (float)(mass > 0 ? mass : 0);
