@@ -921,6 +921,11 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #else
 #define GSDI_X86 0
 #endif
+#if defined(__GNUC__) && !defined(__clang__)
+#define GSDI_UNROLL _Pragma("GCC unroll 4")
+#else
+#define GSDI_UNROLL
+#endif
 #if defined(__GNUC__) || defined(__clang__)
 #define GSDI_PREFETCH(p) __builtin_prefetch(p)
 #else
@@ -1350,6 +1355,7 @@ static void gsdi_splat_box(const gsdi_map *map, uint32_t half, uint32_t x, uint3
     h.at[1] &= 0xffffffu;
     v.at[1] = pole ? y : v.at[1];
     map->sum[leaf].half[half] += weight * ((double)h.length[0] * (double)v.length[0]);
+    GSDI_UNROLL
     for (k = 1; k < 4; ++k) {
         uint32_t i = k & 1, j = k >> 1, left = h.at[i] ^ (j & pole) << 23, low = v.at[j], to = depth;
         uint32_t node = gsdi_map_node(map, left, low, &to);

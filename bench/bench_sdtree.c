@@ -753,9 +753,12 @@ static void bench_learning(const options *o, const machine *m)
 {
     static const struct {
         gsd_target target;
+        gsd_denoise_mode denoise;
+        double goal;
         const char *name;
-    } kind[] = {{GSD_TARGET_RADIANCE, "record + accumulate + refine, radiance"},
-                {GSD_TARGET_SWITCHING, "record + accumulate + refine, switching"}};
+    } kind[] = {{GSD_TARGET_RADIANCE, GSD_DENOISE_DEFAULT, 80, "record + accumulate + refine, radiance"},
+                {GSD_TARGET_RADIANCE, GSD_DENOISE_OFF, 0, "the same without denoising"},
+                {GSD_TARGET_SWITCHING, GSD_DENOISE_DEFAULT, 80, "record + accumulate + refine, switching"}};
     int log2n = o->quick ? 18 : 22;
     printf(
         "\nlearning SF1, 2^%d samples in %d updates; limit: four passes over the 48 bytes of a sample at %.1f GB/s\n",
@@ -766,7 +769,7 @@ static void bench_learning(const options *o, const machine *m)
     gsd_desc resolved;
     check(gsd_resolve(&o->desc, &resolved), "resolve");
     naive_learner naive = naive_create(1000, (double)resolved.rho);
-    for (int k = 0; k < 2; ++k) {
+    for (int k = 0; k < 3; ++k) {
         gsd_stats stats;
         double best = 1e30, times[5];
         learning t, fastest = {0, 0, 0, 1};
@@ -774,6 +777,7 @@ static void bench_learning(const options *o, const machine *m)
         for (int repeat = 0; repeat < repeats; ++repeat) {
             gsd_desc desc = o->desc;
             desc.target = kind[k].target;
+            desc.denoise = kind[k].denoise;
             bool first = k == 0 && repeat == 0;
             gsd_field *field = learn(&desc, log2n, 1, &t, first ? &naive : NULL, &naive_ns);
             naive_ns *= first ? 1e9 / (double)t.samples : 1; /* were seconds */
@@ -786,7 +790,7 @@ static void bench_learning(const options *o, const machine *m)
             gsd_get_stats(field, &stats);
             gsd_destroy(field);
         }
-        row(kind[k].name, bench_summary(times, repeats), 4 * 48 / m->bandwidth, naive_ns, 80);
+        row(kind[k].name, bench_summary(times, repeats), 4 * 48 / m->bandwidth, naive_ns, kind[k].goal);
         printf("    record %.1f, accumulate %.1f, refine %.1f ns/sample; %u cells, %.0f nodes and %.0f bytes per cell, "
                "%.1f bytes per node; mean depth %.1f\n",
                fastest.record / (double)fastest.samples * 1e9, fastest.accumulate / (double)fastest.samples * 1e9,
