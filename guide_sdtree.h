@@ -3733,7 +3733,8 @@ GSDI_AVX2 static void gsdi_extend_avx2(gsdi_draws *d, uint32_t lanes, double e)
 }
 
 /* Eight nodes from lane i on, their four words in columns. */
-GSDI_AVX2 static void gsdi_nodes_avx2(const gsd_node *nodes, const uint32_t *node, __m256 column[4])
+__attribute__((always_inline)) GSDI_AVX2 static inline void gsdi_nodes_avx2(const gsd_node *nodes, const uint32_t *node,
+                                                                            __m256 column[4])
 {
     __m256 row[4], t[4];
     uint32_t i;

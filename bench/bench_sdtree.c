@@ -757,7 +757,7 @@ static void bench_learning(const options *o, const machine *m)
         double goal;
         const char *name;
     } kind[] = {{GSD_TARGET_RADIANCE, GSD_DENOISE_DEFAULT, 80, "record + accumulate + refine, radiance"},
-                {GSD_TARGET_RADIANCE, GSD_DENOISE_OFF, 0, "the same without denoising"},
+                {GSD_TARGET_RADIANCE, GSD_DENOISE_OFF, 0, "record + accumulate + refine, denoise off"},
                 {GSD_TARGET_SWITCHING, GSD_DENOISE_DEFAULT, 80, "record + accumulate + refine, switching"}};
     int log2n = o->quick ? 18 : 22;
     printf(
