@@ -754,19 +754,23 @@ GSD_QUERY uint32_t gsd_choose_of_eight(const float *weight, double *r)
 }
 
 /* First step of sampling a product: choose a row of bins by r[1], a bin in it by r[0], which become the place in the
-   node that the bin's jump leads to. weight, row: from gsd_bin_weights. */
-GSD_QUERY uint32_t gsd_choose_bin(const gsd_view *view, const gsd_handle *handle, const float *weight, const float *row,
-                                  double r[2])
+   bin. weight, row: from gsd_bin_weights. */
+GSD_QUERY uint32_t gsd_choose_bin(const float *weight, const float *row, double r[2])
 {
-    uint32_t y = gsd_choose_of_eight(row, &r[1]), x = gsd_choose_of_eight(weight + y * 8, &r[0]);
-    uint32_t node = view->jumps[handle->jump + y * 8 + x], depth, mask;
-    if (view->nodes[node].leaf.child == 0 && (depth = view->nodes[node].leaf.x >> 24) < 3) { /* the bin is a part */
+    uint32_t y = gsd_choose_of_eight(row, &r[1]);
+    return y * 8 + gsd_choose_of_eight(weight + y * 8, &r[0]);
+}
+
+/* The place in a bin becomes that in the node its jump leads to: the same, unless that is a leaf of several bins. */
+GSD_QUERY void gsd_leave_bin(const gsd_node *node, uint32_t bin, double r[2])
+{
+    uint32_t depth = node->leaf.x >> 24, mask;
+    if (node->leaf.child == 0 && depth < 3) {
         double part = 1.0 / (double)(8u >> depth);
         mask = (8u >> depth) - 1;
-        r[0] = ((double)(x & mask) + r[0]) * part;
-        r[1] = ((double)(y & mask) + r[1]) * part;
+        r[0] = ((double)(bin & mask) + r[0]) * part;
+        r[1] = ((double)(bin >> 3 & mask) + r[1]) * part;
     }
-    return node;
 }
 
 /* Probabilities of the bins under the product, and the sums of the 8 rows. */
@@ -797,8 +801,11 @@ GSD_QUERY float gsd_sample(const gsd_view *view, const gsd_handle *handle, const
     r[0] = r[0] < 0.99999999988 ? r[0] : 0.99999999988;
     if (handle->product > 0) {
         float weight[64], row[8];
+        uint32_t bin;
         gsd_bin_weights(view, handle, weight, row);
-        node = gsd_choose_bin(view, handle, weight, row, r);
+        bin = gsd_choose_bin(weight, row, r);
+        node = view->jumps[handle->jump + bin];
+        gsd_leave_bin(&view->nodes[node], bin, r);
     } else if (handle->alias_count) {
         double slot = r[0] * (double)handle->alias_count;
         const gsd_alias *a = &view->aliases[handle->alias + (uint32_t)slot];
@@ -952,6 +959,11 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #else
 #define GSDI_NEON 0
 #endif
+#if defined(__GNUC__) && !defined(__clang__)
+#define GSDI_UNROLL _Pragma("GCC unroll 4")
+#else
+#define GSDI_UNROLL
+#endif
 #if defined(__GNUC__) || defined(__clang__)
 #define GSDI_PREFETCH(p) __builtin_prefetch(p)
 #else
@@ -972,10 +984,13 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_ROUND (1u << 18) /* samples sorted at once */
 #define GSDI_SEGMENT 2048u    /* samples prepared at once */
 #define GSDI_STACK 96         /* of a walk through a quadtree: 3 * depth 20 + 4 is the most */
-#define GSDI_GATE_LOW 4       /* values of a below 1 at which V(a) is estimated */
-#define GSDI_MAX_VALUE 9.9e29 /* radiance or weight from here on is a bad sample */
-#define GSDI_MAX_ROOT 1e15    /* values are clamped to this before squaring */
-#define GSDI_CONFIDENCE 1.645 /* one-sided 95 % of the normal distribution */
+#define GSDI_MAP_LEVELS 4u    /* of a quadtree that are unfolded for a cell's samples */
+#define GSDI_MAP_FIRST(level) (((1u << 2 * (level)) - 1) & 0x55555555u) /* (4^level - 1) / 3 */
+#define GSDI_MAP_NODES 341                                              /* GSDI_MAP_FIRST(GSDI_MAP_LEVELS + 1) */
+#define GSDI_GATE_LOW 4        /* values of a below 1 at which V(a) is estimated */
+#define GSDI_MAX_VALUE 9.9e29f /* radiance or weight from here on is a bad sample */
+#define GSDI_MAX_ROOT 1e15     /* values are clamped to this before squaring */
+#define GSDI_CONFIDENCE 1.645  /* one-sided 95 % of the normal distribution */
 #define GSDI_MIN_EFFECTIVE                                                                                             \
     128.0                         /* effective non-zero samples for the verdict "this tree does not pay"; fewer closes \
                                      cells whose light is rarely found */
@@ -1274,103 +1289,128 @@ typedef struct gsdi_visit {
     gsdi_sum sum;
 } gsdi_visit;
 
-/* Leaf of a building tree at 24-bit coordinates; *depth = its depth. */
-static uint32_t gsdi_building_leaf(const uint32_t *child, uint32_t x, uint32_t y, uint32_t *depth)
+/* The first levels of a building tree as pictures, made for the samples of a cell: in that of level l, row
+   y >> (24 - l) and column x >> (24 - l) name the node of depth l there, or the leaf above. */
+typedef struct gsdi_map {
+    const uint32_t *child;
+    gsdi_sum *sum;
+    uint32_t levels;
+    uint32_t node[GSDI_MAP_NODES];
+    unsigned char depth[GSDI_MAP_NODES];
+} gsdi_map;
+
+/* For so many samples: pictures that cost less than they save. */
+static void gsdi_map_make(gsdi_map *map, const uint32_t *child, gsdi_sum *sum, uint32_t samples)
 {
-    uint32_t node = 0, shift = 24;
-    while (child[node]) {
-        --shift;
-        node = child[node] + ((x >> shift) & 1u) + 2 * ((y >> shift) & 1u);
+    uint32_t l, x, y, k;
+    map->child = child;
+    map->sum = sum;
+    map->node[0] = map->depth[0] = 0;
+    for (l = 0; l < GSDI_MAP_LEVELS && (2u << 2 * l) <= samples; ++l) {
+        uint32_t n = 1u << l, at = GSDI_MAP_FIRST(l), to = GSDI_MAP_FIRST(l + 1);
+        for (y = 0; y < n; ++y)
+            for (x = 0; x < n; ++x, ++at) {
+                uint32_t c = child[map->node[at]];
+                for (k = 0; k < 4; ++k) {
+                    uint32_t i = to + (2 * y + (k >> 1)) * 2 * n + 2 * x + (k & 1);
+                    map->node[i] = c ? c + k : map->node[at];
+                    map->depth[i] = (unsigned char)(map->depth[at] + (c != 0));
+                }
+            }
     }
-    *depth = 24 - shift;
+    map->levels = l;
+}
+
+/* Node of this depth at 24-bit coordinates, or the leaf above; *depth becomes its depth. */
+static uint32_t gsdi_map_node(const gsdi_map *map, uint32_t x, uint32_t y, uint32_t *depth)
+{
+    uint32_t level = *depth < map->levels ? *depth : map->levels, shift = 24 - level, c;
+    uint32_t i = GSDI_MAP_FIRST(level) + (y >> shift << level | x >> shift), node = map->node[i];
+    for (level = map->depth[i]; level < *depth && (c = map->child[node]) != 0; ++level) {
+        --shift;
+        node = c + ((x >> shift) & 1u) + 2 * ((y >> shift) & 1u);
+    }
+    *depth = level;
     return node;
 }
 
-/* A square region of a quadtree: node, lowest corner, side. */
-typedef struct gsdi_square {
-    uint32_t node, x, y, size;
-} gsdi_square;
+/* Add weight * (overlap area) to every leaf that overlaps a rectangle. */
+typedef struct gsdi_rectangle {
+    const gsdi_map *map;
+    uint32_t half, x[2], y[2]; /* from, to */
+    double weight;
+} gsdi_rectangle;
 
-/* Add weight * (overlap area) to every leaf below `root` that overlaps [x0, x1) x [y0, y1), which lies within it. */
-static void gsdi_splat_rectangle(const uint32_t *child, gsdi_sum *sum, uint32_t half_of, gsdi_square root,
-                                 const uint32_t x[2], const uint32_t y[2], double weight)
+static uint32_t gsdi_overlap(const uint32_t with[2], uint32_t from, uint32_t size)
 {
-    gsdi_square stack[GSDI_STACK];
-    uint32_t top = 0, k;
-    stack[top++] = root;
-    while (top) {
-        gsdi_square b = stack[--top];
-        uint32_t c = child[b.node], half = b.size >> 1;
-        uint32_t xa = x[0] > b.x ? x[0] : b.x, xb = x[1] < b.x + b.size ? x[1] : b.x + b.size;
-        uint32_t ya = y[0] > b.y ? y[0] : b.y, yb = y[1] < b.y + b.size ? y[1] : b.y + b.size;
-        if (xa >= xb || ya >= yb)
-            continue;
-        if (!c) {
-            sum[b.node].half[half_of] += weight * ((double)(xb - xa) * (double)(yb - ya));
-            continue;
-        }
-        for (k = 4; k-- > 0;) {
-            gsdi_square *s = &stack[top++];
-            s->node = c + k;
-            s->x = b.x + (k & 1) * half;
-            s->y = b.y + (k >> 1) * half;
-            s->size = half;
-        }
+    uint32_t a = with[0] > from ? with[0] : from, b = with[1] < from + size ? with[1] : from + size;
+    return b > a ? b - a : 0;
+}
+
+/* The same within the square of an inner node: lowest corner, side. Leaves beside the rectangle get 0: no branches. */
+static void gsdi_splat_rectangle(const gsdi_rectangle *r, uint32_t node, uint32_t x, uint32_t y, uint32_t size)
+{
+    uint32_t c = r->map->child[node], half = size >> 1, k;
+    for (k = 0; k < 4; ++k) {
+        uint32_t left = x + (k & 1) * half, low = y + (k >> 1) * half;
+        double area = (double)gsdi_overlap(r->x, left, half) * (double)gsdi_overlap(r->y, low, half);
+        if (!r->map->child[c + k])
+            r->map->sum[c + k].half[r->half] += r->weight * area;
+        else if (area > 0)
+            gsdi_splat_rectangle(r, c + k, left, low, half);
     }
+}
+
+/* Where a box of this side, centred at x, lies: in the square of its size around x [0] and in the one beside it [1],
+   above if upper, else below. at: a coordinate in each. Without branches: either is as likely. */
+typedef struct gsdi_sides {
+    uint32_t upper, at[2], length[2];
+} gsdi_sides;
+
+static gsdi_sides gsdi_box_sides(uint32_t x, uint32_t size)
+{
+    gsdi_sides s;
+    uint32_t middle = size / 2, sign;
+    s.upper = (x & middle) != 0;
+    sign = s.upper - 1; /* all bits set: below */
+    s.at[0] = x;
+    s.at[1] = x + ((size ^ sign) - sign);
+    s.length[1] = (((x & (size - 1)) - middle) ^ sign) - sign;
+    s.length[0] = size - s.length[1];
+    return s;
 }
 
 /* Box filter [Mueller 2019]: spread value over a box of the size of the leaf at (x, y), centred there. phi wraps; what
    passes a pole comes back at phi + half a turn. The sum over all leaves grows by value. The box overlaps four squares
-   of its own size; each is a leaf, part of a larger one, or divided further. */
-static void gsdi_splat_box(const uint32_t *child, gsdi_sum *sum, uint32_t half, uint32_t x, uint32_t y, double value)
+   of its own size: k = 0 the leaf, 1 beside it, 2 above or below it, 3 beside that one; each of 1 .. 3 is a leaf, part
+   of a larger one, or divided further. */
+static void gsdi_splat_box(const gsdi_map *map, uint32_t half, uint32_t x, uint32_t y, double value)
 {
-    uint32_t depth, leaf = gsdi_building_leaf(child, x, y, &depth);
-    int32_t size = 16777216 >> depth, xs[3], ys[3], i, j;
+    uint32_t depth = 24, leaf = gsdi_map_node(map, x, y, &depth), size = 16777216u >> depth, k;
+    gsdi_sides h = gsdi_box_sides(x, size), v = gsdi_box_sides(y, size);
+    uint32_t pole = v.at[1] >> 24 & 1u;
     double weight = value / ((double)size * (double)size);
-    if (depth == 0) {
-        sum[leaf].half[half] += value;
-        return;
-    }
-    xs[0] = (int32_t)x - size / 2;
-    xs[1] = (xs[0] + size - 1) & -size;
-    xs[2] = xs[0] + size;
-    ys[0] = (int32_t)y - size / 2;
-    ys[1] = (ys[0] + size - 1) & -size;
-    ys[2] = ys[0] + size;
-    for (j = 0; j < 2; ++j) {
-        int32_t low = ys[j], height = ys[j + 1] - ys[j], turn = 0;
-        if (low < 0 || low >= 16777216) { /* past a pole */
-            low = low < 0 ? -ys[j + 1] : 33554432 - ys[j + 1];
-            turn = 8388608;
-        }
-        for (i = 0; i < 2; ++i) {
-            uint32_t left = (uint32_t)(xs[i] + turn) & 0xffffffu, bottom = (uint32_t)low, shift = 24, node = 0;
-            int32_t width = xs[i + 1] - xs[i];
-            if (width == 0 || height == 0)
-                continue;
-            if (xs[i] <= (int32_t)x && (int32_t)x < xs[i + 1] && ys[j] <= (int32_t)y && (int32_t)y < ys[j + 1]) {
-                sum[leaf].half[half] += weight * ((double)width * (double)height);
-                continue;
-            }
-            while (child[node] && shift > 24 - depth) {
-                --shift;
-                node = child[node] + ((left >> shift) & 1u) + 2 * ((bottom >> shift) & 1u);
-            }
-            if (child[node]) {
-                gsdi_square root = {0, 0, 0, 0};
-                uint32_t rx[2], ry[2];
-                root.node = node;
-                root.size = (uint32_t)size;
-                root.x = left & ~(root.size - 1);
-                root.y = bottom & ~(root.size - 1);
-                rx[0] = left;
-                rx[1] = left + (uint32_t)width;
-                ry[0] = bottom;
-                ry[1] = bottom + (uint32_t)height;
-                gsdi_splat_rectangle(child, sum, half, root, rx, ry, weight);
-            } else {
-                sum[node].half[half] += weight * ((double)width * (double)height);
-            }
+    h.at[1] &= 0xffffffu;
+    v.at[1] = pole ? y : v.at[1];
+    map->sum[leaf].half[half] += weight * ((double)h.length[0] * (double)v.length[0]);
+    GSDI_UNROLL
+    for (k = 1; k < 4; ++k) {
+        uint32_t i = k & 1, j = k >> 1, left = h.at[i] ^ (j & pole) << 23, low = v.at[j], to = depth;
+        uint32_t node = gsdi_map_node(map, left, low, &to);
+        if (map->child[node]) {
+            gsdi_rectangle part;
+            part.map = map;
+            part.half = half;
+            part.weight = weight;
+            left &= ~(size - 1);
+            low &= ~(size - 1);
+            part.x[0] = left + (h.upper == i ? 0 : size - h.length[i]);
+            part.x[1] = part.x[0] + h.length[i];
+            part.y[0] = low + ((v.upper ^ (j & pole)) == j ? 0 : size - v.length[j]);
+            part.y[1] = part.y[0] + v.length[j];
+            gsdi_splat_rectangle(&part, node, left, low, size);
+        } else {
+            map->sum[node].half[half] += weight * ((double)h.length[i] * (double)v.length[j]);
         }
     }
 }
@@ -2496,12 +2536,11 @@ typedef struct gsdi_accumulation {
 /* False where a sample is bad: not finite, negative, out of range, no density. */
 static bool gsdi_sample_valid(const gsd_training_sample *s)
 {
-    return s->radiance >= 0 && (double)s->radiance < GSDI_MAX_VALUE && s->contribution >= 0 &&
-           (double)s->contribution < GSDI_MAX_VALUE && s->pixel_contribution >= 0 &&
-           (double)s->pixel_contribution < GSDI_MAX_VALUE && s->pdf_mix > 0 && gsdi_finite(s->pdf_mix) &&
-           s->pdf_bsdf >= 0 && gsdi_finite(s->pdf_bsdf) && s->pdf_guide >= 0 && gsdi_finite(s->pdf_guide) &&
-           (double)s->radiance < GSDI_MAX_VALUE * (double)s->pdf_mix &&
-           gsdi_finite(s->position[0] + s->position[1] + s->position[2]);
+    const float most = GSDI_MAX_VALUE, finite = 3.4028234e38f;
+    return s->radiance >= 0 && s->radiance < most && s->contribution >= 0 && s->contribution < most &&
+           s->pixel_contribution >= 0 && s->pixel_contribution < most && s->pdf_mix > 0 && s->pdf_mix <= finite &&
+           s->pdf_bsdf >= 0 && s->pdf_bsdf <= finite && s->pdf_guide >= 0 && s->pdf_guide <= finite &&
+           s->radiance < most * s->pdf_mix && gsdi_finite(s->position[0] + s->position[1] + s->position[2]);
 }
 
 /* Cells of a sample: where it lies and where it is added. Sets the item's bin. False: no such cell. */
@@ -2509,8 +2548,7 @@ static bool gsdi_locate(gsdi_accumulation *a, const gsd_training_sample *s, uint
                         gsdi_segment *segment)
 {
     const gsd_view *view = &a->view;
-    uint32_t g[3], cell, axis, bin = 0;
-    const gsdi_state *state;
+    uint32_t g[3], cell, level, axis, bin = 0;
     bool outside = false;
     if (a->field->desc.forest_cells) {
         memcpy(&cell, s->position, sizeof cell);
@@ -2525,16 +2563,15 @@ static bool gsdi_locate(gsdi_accumulation *a, const gsd_training_sample *s, uint
     segment->clamped += outside;
     cell = gsd_cell_at(view, g);
     a->read_cell[at] = a->target_cell[at] = cell;
-    state = &a->field->states[cell];
-    for (axis = 0; axis < 3; ++axis) {
-        bin = bin << 2 | ((g[axis] >> (22 - (state->level + 2 - axis) / 3)) & 3u);
-    }
+    level = view->cells[cell].level;
+    for (axis = 0; axis < 3; ++axis)
+        bin = bin << 2 | ((g[axis] >> (22 - (level + 2 - axis) / 3)) & 3u);
     item->x |= bin << 24;
     if (a->stochastic) {
         double u[3];
         gsdi_sample_random(s, u);
         for (axis = 0; axis < 3; ++axis) {
-            double t = (double)g[axis] + (u[axis] - 0.5) * (double)gsd_cell_extent(state->level, axis);
+            double t = (double)g[axis] + (u[axis] - 0.5) * (double)gsd_cell_extent(level, axis);
             g[axis] = t <= 0 ? 0 : t < 16777215.0 ? (uint32_t)t : 16777215u;
         }
         a->target_cell[at] = gsd_cell_at(view, g);
@@ -2681,39 +2718,47 @@ static void gsdi_learn(const gsdi_accumulation *a, gsdi_state *state, const gsd_
     item->pixel = (float)(value < 1e30 ? value : 1e30);
 }
 
-static void gsdi_splat(const gsdi_accumulation *a, uint32_t cell, const gsdi_item *item)
+static void gsdi_cell_map(const gsdi_accumulation *a, uint32_t cell, gsdi_map *map)
 {
-    const gsdi_state *state = &a->field->states[cell];
-    const uint32_t *child = a->field->child + state->first;
-    gsdi_sum *sum = a->field->sum + state->first;
-    uint32_t x = item->x & 0xffffffu, y = item->y, half = (x ^ y) & 1u, depth;
+    uint32_t first = a->field->states[cell].first;
+    gsdi_map_make(map, a->field->child + first, a->field->sum + first, a->start[cell + 1] - a->start[cell]);
+}
+
+/* Add an item to the quadtree. */
+static void gsdi_splat(const gsdi_accumulation *a, const gsdi_map *map, gsdi_state *state, const gsdi_item *item)
+{
+    uint32_t x = item->x & 0xffffffu, y = item->y, half = (x ^ y) & 1u, depth = 24;
+    state->held += 1; /* one by one: sums that refine has scaled round alike for any cut */
     if (!(item->pixel > 0))
         return;
+    state->lit += 1;
     if (a->box)
-        gsdi_splat_box(child, sum, half, x, y, (double)item->pixel);
+        gsdi_splat_box(map, half, x, y, (double)item->pixel);
     else
-        sum[gsdi_building_leaf(child, x, y, &depth)].half[half] += (double)item->pixel;
+        map->sum[gsdi_map_node(map, x, y, &depth)].half[half] += (double)item->pixel;
 }
 
 /* Busy cells [begin, end): statistics, and the quadtree sums where both belong to the same cell. */
 static void gsdi_learn_cells(void *context, uint32_t begin, uint32_t end)
 {
     gsdi_accumulation *a = (gsdi_accumulation *)context;
-    uint32_t b, i;
+    uint32_t b, i, last = a->start[a->view.cell_count];
     for (b = begin; b < end; ++b) {
         uint32_t cell = a->busy[b], stop = a->start[cell + 1];
         gsd_handle handle = gsd_find_cell(&a->view, cell);
         gsdi_state *state = &a->field->states[cell];
+        gsdi_map map;
+        if (!a->stochastic)
+            gsdi_cell_map(a, cell, &map);
         for (i = a->start[cell]; i < stop; ++i) {
             gsdi_item *item = &a->items[a->order[i]];
-            if (i + 8 < stop)
-                GSDI_PREFETCH(&a->items[a->order[i + 8]]);
-            gsdi_learn(a, state, &handle, item);
-            if (!a->stochastic) {
-                state->held += 1;
-                state->lit += item->pixel > 0;
-                gsdi_splat(a, cell, item);
+            if (i + 8 < last) {
+                GSDI_PREFETCH(&a->items[a->order[i + 8]].x);
+                GSDI_PREFETCH(&a->items[a->order[i + 8]].normal); /* may lie in the next cache line */
             }
+            gsdi_learn(a, state, &handle, item);
+            if (!a->stochastic)
+                gsdi_splat(a, &map, state, item);
         }
     }
 }
@@ -2725,11 +2770,10 @@ static void gsdi_splat_cells(void *context, uint32_t begin, uint32_t end)
     uint32_t b, i;
     for (b = begin; b < end; ++b) {
         uint32_t cell = a->busy[b];
-        for (i = a->start[cell]; i < a->start[cell + 1]; ++i) {
-            a->field->states[cell].held += 1; /* one by one: sums that refine has scaled round alike for any cut */
-            a->field->states[cell].lit += a->items[a->order[i]].pixel > 0;
-            gsdi_splat(a, cell, &a->items[a->order[i]]);
-        }
+        gsdi_map map;
+        gsdi_cell_map(a, cell, &map);
+        for (i = a->start[cell]; i < a->start[cell + 1]; ++i)
+            gsdi_splat(a, &map, &a->field->states[cell], &a->items[a->order[i]]);
     }
 }
 
@@ -3142,9 +3186,10 @@ static void gsdi_tree_aliases(gsdi_block *b, const gsdi_tree *tree)
     uint32_t n = 0, i, small = GSDI_NONE, large = GSDI_NONE, current = GSDI_NONE;
     for (i = tree->first; i < tree->first + tree->groups * 4; ++i) {
         const gsd_node *node = &nodes[i];
-        double area = 12.566370614359172 / pow(4, (double)(node->leaf.x >> 24)), mass;
+        double area, mass;
         if (node->leaf.child)
             continue;
+        area = 12.566370614359172 / (double)((uint64_t)1 << (2 * (node->leaf.x >> 24)));
         mass = ((double)node->leaf.pdf - e * (double)GSD_INV_4PI) / (1 - e) * area * (double)tree->leaves;
         slots[n].node = i;
         slots[n].threshold = (float)(mass > 0 ? mass : 0);
@@ -3209,7 +3254,7 @@ static void gsdi_tree_write(gsdi_block *b, gsdi_tree *tree, const uint32_t *chil
             out->leaf.x = o.x | o.depth << 24;
             out->leaf.y = o.y;
             tree->max_depth = o.depth > tree->max_depth ? o.depth : tree->max_depth;
-            mean += (double)o.depth * o.pdf * 12.566370614359172 / pow(4, (double)o.depth);
+            mean += (double)o.depth * o.pdf * 12.566370614359172 / (double)((uint64_t)1 << (2 * o.depth));
             continue;
         }
         for (k = 0; k < 4; ++k)
@@ -4554,7 +4599,7 @@ GSD_API gsd_result gsd_forest_split(gsd_field *field, uint32_t parent, uint32_t 
 
 /* ---- >>batches ---------------------------------------------------------------------------------------------- */
 
-#define GSDI_LANES 16u /* queries in flight: enough to cover the latency of memory */
+#define GSDI_LANES 64u /* queries in flight; 16 and 32 wait for memory longer */
 
 static uint32_t gsdi_at(const uint32_t *index, uint32_t i) { return index ? index[i] : i; }
 static const float *gsdi_row(const float *base, size_t stride, uint32_t row)
@@ -4667,7 +4712,7 @@ GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t
     }
 }
 
-/* Descend up to 16 trees together, one level of each in turn; node[i] ends at a leaf. */
+/* Descend up to 64 trees together, one level of each in turn; node[i] ends at a leaf. */
 static void gsdi_descend(const gsd_view *view, uint32_t n, uint32_t *node, uint32_t (*xy)[2], uint32_t *shift)
 {
     uint32_t lane[GSDI_LANES], active = n, i;
@@ -4724,10 +4769,10 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 /* State of one sampling query. */
 typedef struct gsdi_draw {
     double r[2], lo[2], width[2];
-    uint32_t node;
+    uint32_t node, bin;
 } gsdi_draw;
 
-/* Follow the inverse distribution of up to 16 draws to leaves, one level of each in turn; see gsd_sample. */
+/* Follow the inverse distribution of up to 64 draws to leaves, one level of each in turn; see gsd_sample. */
 static void gsdi_draw_descend(const gsd_view *view, uint32_t n, gsdi_draw *draws, const bool *tree)
 {
     uint32_t lane[GSDI_LANES], active = 0, i;
@@ -4764,7 +4809,8 @@ static void gsdi_draw_descend(const gsd_view *view, uint32_t n, gsdi_draw *draws
         }
 }
 
-/* Start one draw: 0 = uniform share (r is the place on the sphere), 1 = descend, 2 = alias slot in node. */
+/* Start one draw: 0 = uniform share (r is the place on the sphere), 1 = descend, 2 = alias slot in node, 3 = jump of a
+   bin in node. */
 static int gsdi_draw_start(const gsd_view *view, const gsd_handle *h, const float *u, gsdi_draw *d)
 {
     double e = (double)view->uniform;
@@ -4781,7 +4827,10 @@ static int gsdi_draw_start(const gsd_view *view, const gsd_handle *h, const floa
     if (h->product > 0) {
         float weight[GSDI_BINS], row[8];
         gsd_bin_weights(view, h, weight, row);
-        d->node = gsd_choose_bin(view, h, weight, row, d->r);
+        d->bin = gsd_choose_bin(weight, row, d->r);
+        d->node = h->jump + d->bin;
+        GSDI_PREFETCH(&view->jumps[d->node]);
+        return 3;
     } else if (h->alias_count) {
         double slot = d->r[0] * (double)h->alias_count;
         d->node = h->alias + (uint32_t)slot;
@@ -4805,11 +4854,12 @@ static void gsdi_draw_alias(const gsd_view *view, gsdi_draw *d)
 }
 
 #if GSDI_X86
-/* Sixteen draws as arrays. The steps are those of gsd_sample, in the same operations, so results are equal bit by bit.
+/* Draws as arrays, in groups of eight. The steps are those of gsd_sample, in the same operations, so results are equal
+ * bit by bit.
  */
 typedef struct gsdi_draws {
     double r[2][GSDI_LANES], lo[2][GSDI_LANES], width[2][GSDI_LANES];
-    uint32_t bits[2][GSDI_LANES]; /* of u, 24 each; then extended to 32 */
+    uint32_t bits[2][GSDI_LANES]; /* of u, 24 each; then [1]: the bin of a product */
     uint32_t node[GSDI_LANES];
     float out[3][GSDI_LANES], pdf[GSDI_LANES];
     uint32_t edge[GSDI_LANES]; /* not 0: near the leaf's edge */
@@ -4824,11 +4874,11 @@ GSDI_AVX2 static __m256d gsdi_u32_double(__m128i x)
 }
 
 /* gsd_extend_random, then r[0] without the uniform share. */
-GSDI_AVX2 static void gsdi_extend_avx2(gsdi_draws *d, double e)
+GSDI_AVX2 static void gsdi_extend_avx2(gsdi_draws *d, uint32_t lanes, double e)
 {
     __m256d scale = _mm256_set1_pd(2.3283064365386963e-10);
     uint32_t i;
-    for (i = 0; i < GSDI_LANES; i += 4) {
+    for (i = 0; i < lanes; i += 4) {
         __m128i a = _mm_loadu_si128((const __m128i *)(const void *)&d->bits[0][i]);
         __m128i b = _mm_loadu_si128((const __m128i *)(const void *)&d->bits[1][i]), h, low = _mm_set1_epi32(255);
         h = _mm_xor_si128(
@@ -4848,7 +4898,8 @@ GSDI_AVX2 static void gsdi_extend_avx2(gsdi_draws *d, double e)
 }
 
 /* Eight nodes from lane i on, their four words in columns. */
-GSDI_AVX2 static void gsdi_nodes_avx2(const gsd_node *nodes, const uint32_t *node, __m256 column[4])
+__attribute__((always_inline)) GSDI_AVX2 static inline void gsdi_nodes_avx2(const gsd_node *nodes, const uint32_t *node,
+                                                                            __m256 column[4])
 {
     __m256 row[4], t[4];
     uint32_t i;
@@ -4885,13 +4936,13 @@ GSDI_AVX2 static __m128i gsdi_mask_avx2(__m256d mask)
 }
 
 /* One level down for eight lanes; false when all are at leaves. */
-GSDI_AVX2 static bool gsdi_step_avx2(const gsd_view *view, gsdi_draws *d, uint32_t lane)
+GSDI_AVX2 static bool gsdi_step_avx2(const gsd_node *nodes, gsdi_draws *d, uint32_t lane)
 {
     __m256 column[4];
     __m256i child, active, next;
     __m128i bx[2], by[2];
     uint32_t half, i;
-    gsdi_nodes_avx2(view->nodes, &d->node[lane], column);
+    gsdi_nodes_avx2(nodes, &d->node[lane], column);
     child = _mm256_castps_si256(column[0]);
     active = _mm256_xor_si256(_mm256_cmpeq_epi32(child, _mm256_setzero_si256()), _mm256_set1_epi32(-1));
     if (_mm256_testz_si256(active, active))
@@ -4914,16 +4965,16 @@ GSDI_AVX2 static bool gsdi_step_avx2(const gsd_view *view, gsdi_draws *d, uint32
     next = _mm256_blendv_epi8(_mm256_loadu_si256((const __m256i *)(const void *)&d->node[lane]), next, active);
     _mm256_storeu_si256((__m256i *)(void *)&d->node[lane], next);
     for (i = 0; i < 8; ++i)
-        GSDI_PREFETCH(&view->nodes[d->node[lane + i]]);
+        GSDI_PREFETCH(&nodes[d->node[lane + i]]);
     return true;
 }
 
 /* Places in the leaves: coordinates r in units of 2^-24, whether near the edge, pdf. */
-GSDI_AVX2 static void gsdi_leaves_avx2(const gsd_view *view, gsdi_draws *d, uint32_t lane)
+GSDI_AVX2 static void gsdi_leaves_avx2(const gsd_node *nodes, gsdi_draws *d, uint32_t lane)
 {
     __m256 column[4];
     uint32_t half, k;
-    gsdi_nodes_avx2(view->nodes, &d->node[lane], column);
+    gsdi_nodes_avx2(nodes, &d->node[lane], column);
     _mm256_storeu_ps(&d->pdf[lane], column[1]);
     for (half = 0; half < 2; ++half) {
         uint32_t at = lane + half * 4;
@@ -4989,16 +5040,16 @@ GSDI_AVX2 static void gsdi_directions_avx2(gsdi_draws *d, uint32_t lane)
 
 static bool gsdi_aliased(const gsd_handle *h) { return h->alias_count && !(h->product > 0); }
 
-/* Up to 16 draws. Those of the uniform share, and what has no alias table in a field of them, are done one by one. */
+/* Up to 64 draws. Those of the uniform share, and what has no alias table in a field of them, are done one by one. */
 GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const uint32_t *at, const gsd_handle *handles,
                                        const float *u, size_t u_stride, float *directions, size_t direction_stride,
                                        float *pdf)
 {
     gsdi_draws d;
     double e = (double)view->uniform;
-    bool aliased = gsdi_aliased(&handles[at[0]]), go[2] = {!aliased, !aliased};
-    uint32_t i, k;
-    for (i = 0; i < GSDI_LANES; ++i) {
+    bool aliased = gsdi_aliased(&handles[at[0]]), done[GSDI_LANES / 8];
+    uint32_t lanes = (n + 7) & ~7u, left = aliased ? 0 : lanes, i, k; /* those from n on repeat the first */
+    for (i = 0; i < lanes; ++i) {
         const float *v = gsdi_row(u, u_stride, at[i < n ? i : 0]);
         for (k = 0; k < 2; ++k) {
             int32_t b = (int32_t)(v[k] * 16777216.0f);
@@ -5006,11 +5057,12 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
             d.lo[k][i] = 0;
             d.width[k][i] = 1;
         }
+        done[i / 8] = false;
         d.node[i] = handles[at[i < n ? i : 0]].root;
         GSDI_PREFETCH(&view->nodes[d.node[i]]);
     }
-    gsdi_extend_avx2(&d, e);
-    for (i = 0; !aliased && i < n; ++i) {
+    gsdi_extend_avx2(&d, lanes, e);
+    for (i = 0; !aliased && i < n; ++i) { /* the steps of gsd_choose_bin and gsd_leave_bin, with a prefetch between */
         const gsd_handle *h = &handles[at[i]];
         float weight[GSDI_BINS], row[8];
         double r[2];
@@ -5019,12 +5071,24 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
         gsdi_bin_weights_avx2(view, h, weight, row);
         r[0] = d.r[0][i] > 0 ? d.r[0][i] : 0; /* the uniform share comes later */
         r[1] = d.r[1][i];
-        d.node[i] = gsd_choose_bin(view, h, weight, row, r);
+        d.bits[1][i] = gsd_choose_bin(weight, row, r);
         d.r[0][i] = r[0];
         d.r[1][i] = r[1];
-        GSDI_PREFETCH(&view->nodes[d.node[i]]);
+        GSDI_PREFETCH(&view->jumps[h->jump + d.bits[1][i]]);
     }
-    for (i = 0; aliased && i < GSDI_LANES; ++i) {
+    for (i = 0; !aliased && i < n; ++i)
+        if (handles[at[i]].product > 0) {
+            d.node[i] = view->jumps[handles[at[i]].jump + d.bits[1][i]];
+            GSDI_PREFETCH(&view->nodes[d.node[i]]);
+        }
+    for (i = 0; !aliased && i < n; ++i)
+        if (handles[at[i]].product > 0) {
+            double r[2] = {d.r[0][i], d.r[1][i]};
+            gsd_leave_bin(&view->nodes[d.node[i]], d.bits[1][i], r);
+            d.r[0][i] = r[0];
+            d.r[1][i] = r[1];
+        }
+    for (i = 0; aliased && i < lanes; ++i) {
         const gsd_handle *h = &handles[at[i < n ? i : 0]];
         double slot = d.r[0][i] * (double)h->alias_count;
         slot = slot > 0 ? slot : 0; /* the uniform share comes later */
@@ -5032,25 +5096,23 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
         d.r[0][i] = slot - (double)(int64_t)slot;
         GSDI_PREFETCH(&view->aliases[d.node[i]]);
     }
-    for (i = 0; aliased && i < GSDI_LANES; ++i) {
+    for (i = 0; aliased && i < lanes; ++i) { /* without branches: either leaf may be the one */
         const gsd_alias *a = &view->aliases[d.node[i]];
-        double t = (double)a->threshold;
-        bool own = d.r[0][i] < t;
-        if (!gsdi_aliased(&handles[at[i < n ? i : 0]]))
-            continue;
-        d.lo[0][i] = own ? 0 : t;
-        d.width[0][i] = own ? t : 1 - t;
-        d.node[i] = own ? a->node : a->other;
+        uint32_t other = !(d.r[0][i] < (double)a->threshold);
+        d.lo[0][i] = (double)other * (double)a->threshold;
+        d.width[0][i] = fabs((double)other - (double)a->threshold);
+        d.node[i] = a->node ^ ((a->node ^ a->other) & (0 - other));
+        d.node[i] = gsdi_aliased(&handles[at[i < n ? i : 0]]) ? d.node[i] : 0;
         GSDI_PREFETCH(&view->nodes[d.node[i]]);
     }
-    for (i = 0; aliased && i < GSDI_LANES; ++i)
-        d.node[i] = gsdi_aliased(&handles[at[i < n ? i : 0]]) ? d.node[i] : 0;
-    while (go[0] || go[1]) {
-        go[0] = go[0] && gsdi_step_avx2(view, &d, 0);
-        go[1] = go[1] && gsdi_step_avx2(view, &d, 8);
-    }
-    for (i = 0; i < GSDI_LANES; i += 8) {
-        gsdi_leaves_avx2(view, &d, i);
+    while (left)
+        for (i = 0; i < lanes; i += 8)
+            if (!done[i / 8] && !gsdi_step_avx2(view->nodes, &d, i)) {
+                done[i / 8] = true;
+                left -= 8;
+            }
+    for (i = 0; i < lanes; i += 8) {
+        gsdi_leaves_avx2(view->nodes, &d, i);
         gsdi_directions_avx2(&d, i);
     }
     for (i = 0; i < n; ++i) {
@@ -5091,11 +5153,18 @@ GSD_API void gsd_sample_batch(const gsd_view *view, uint32_t count, const uint32
         for (i = 0; i < n; ++i) {
             uint32_t at = gsdi_at(index, start + i);
             kind[i] = gsdi_draw_start(view, &handles[at], gsdi_row(u, u_stride, at), &draws[i]);
-            tree[i] = kind[i] == 1;
+            tree[i] = kind[i] & 1;
         }
         for (i = 0; i < n; ++i)
-            if (kind[i] == 2)
+            if (kind[i] == 2) {
                 gsdi_draw_alias(view, &draws[i]);
+            } else if (kind[i] == 3) {
+                draws[i].node = view->jumps[draws[i].node];
+                GSDI_PREFETCH(&view->nodes[draws[i].node]);
+            }
+        for (i = 0; i < n; ++i)
+            if (kind[i] == 3)
+                gsd_leave_bin(&view->nodes[draws[i].node], draws[i].bin, draws[i].r);
         gsdi_draw_descend(view, n, draws, tree);
         for (i = 0; i < n; ++i) {
             uint32_t at = gsdi_at(index, start + i);

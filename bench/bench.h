@@ -119,25 +119,26 @@ static inline double bench_load_latency(size_t bytes)
     return ns;
 }
 
-/* Nanoseconds per load of a random cache line out of `bytes`, the loads independent of each other: what a perfectly
-   interleaved search pays per line that it touches. */
+/* Nanoseconds per load of a random cache line out of `bytes`, the loads independent of each other and their addresses
+   known long before: what a perfectly interleaved search pays per line that it touches. */
 static inline double bench_load_throughput(size_t bytes)
 {
-    size_t n = bytes / 64, steps = 1 << 20;
-    uint64_t *data = malloc(n * 64), sum = 0;
+    size_t n = bytes / 64 + 1, steps = 1 << 20;
+    uint64_t *data = malloc(n * 64), sum = 0, seed = 2;
+    uint32_t *at = malloc(steps * sizeof *at);
     double ns = 0;
-    if (data && n) {
+    if (data && at) {
         memset(data, 1, n * 64);
+        for (size_t i = 0; i < steps; ++i)
+            at[i] = (uint32_t)(bench_random(&seed) % n);
         BENCH_MIN_NS(ns, 4, steps, {
-            for (uint32_t i = 0; i < steps; ++i) {
-                uint32_t h = i * UINT32_C(0x9e3779b1);
-                h = (h ^ (h >> 15)) * UINT32_C(0x85ebca6b);
-                sum += data[8 * (size_t)(((uint64_t)h * n) >> 32)];
-            }
+            for (size_t i = 0; i < steps; ++i)
+                sum += data[8 * (size_t)at[i]];
             bench_use(&sum);
         });
     }
     free(data);
+    free(at);
     return ns;
 }
 

@@ -46,10 +46,14 @@ static void *allocate(size_t count, size_t size)
 
 /* ---- rows --------------------------------------------------------------------------------------------------- */
 
+/* Arrays that queries read. */
+enum { AREA_SPACE, AREA_NODES, AREA_JUMPS, AREA_MASSES, AREA_ALIASES, AREAS };
+static const char *const area_name[AREAS] = {"grid, spatial tree and cells", "nodes", "jumps", "masses", "alias slots"};
+
 typedef struct machine {
-    double latency, throughput; /* of a random cache line of the field, ns */
-    double cached;              /* of a cache line in 256 KB, ns, independent loads */
-    double bandwidth;           /* bytes per ns */
+    double latency[AREAS], throughput[AREAS]; /* of a random cache line in a block of that size, ns */
+    double cached;                            /* of a cache line in 256 KB, ns, independent loads */
+    double bandwidth;                         /* bytes per ns */
 } machine;
 
 static FILE *json_file;
@@ -172,19 +176,20 @@ static gsd_field *make_field(const options *o, bool alias)
 /* Queries: positions on the walls; directions uniform, and drawn from the field. */
 typedef struct queries {
     uint32_t count;
-    float *position, *u, *uniform, *guided; /* [count][3], [2], [3], [3] */
-    double *position_d, *u_d, *guided_d;    /* the naive tree's copies: position in [0,1)^3 of the grid */
+    float *position, *u, *uniform, *guided, *normal; /* [count][3], [2], [3], [3], [3] */
+    double *position_d, *u_d, *guided_d;             /* the naive tree's copies: position in [0,1)^3 of the grid */
     double *uniform_d;
 } queries;
 
 static queries make_queries(uint32_t count, const gsd_view *view)
 {
-    queries q = {count, 0, 0, 0, 0, 0, 0, 0, 0};
+    queries q = {count, 0, 0, 0, 0, 0, 0, 0, 0, 0};
     sf1_rng rng = {23};
     q.position = allocate(3 * count, sizeof(float));
     q.u = allocate(2 * count, sizeof(float));
     q.uniform = allocate(3 * count, sizeof(float));
     q.guided = allocate(3 * count, sizeof(float));
+    q.normal = allocate(3 * count, sizeof(float));
     q.position_d = allocate(3 * count, sizeof(double));
     q.u_d = allocate(2 * count, sizeof(double));
     q.guided_d = allocate(3 * count, sizeof(double));
@@ -197,6 +202,7 @@ static queries make_queries(uint32_t count, const gsd_view *view)
         sf1_around(up, 2 * sf1_uniform(&rng) - 1, sf1_uniform(&rng), w);
         for (int k = 0; k < 3; ++k) {
             q.position[3 * i + k] = (float)p.x[k];
+            q.normal[3 * i + k] = (float)p.n[k];
             q.uniform[3 * i + k] = (float)w[k];
         }
         for (int k = 0; k < 2; ++k)
@@ -222,6 +228,7 @@ static void free_queries(queries *q)
     free(q->u);
     free(q->uniform);
     free(q->guided);
+    free(q->normal);
     free(q->position_d);
     free(q->u_d);
     free(q->guided_d);
@@ -263,6 +270,7 @@ static queries sorted_queries(const queries *from, const gsd_view *view)
     q.u = permuted(q.u, key, q.count, 2 * sizeof(float));
     q.uniform = permuted(q.uniform, key, q.count, 3 * sizeof(float));
     q.guided = permuted(q.guided, key, q.count, 3 * sizeof(float));
+    q.normal = permuted(q.normal, key, q.count, 3 * sizeof(float));
     q.position_d = permuted(q.position_d, key, q.count, 3 * sizeof(double));
     q.u_d = permuted(q.u_d, key, q.count, 2 * sizeof(double));
     q.guided_d = permuted(q.guided_d, key, q.count, 3 * sizeof(double));
@@ -316,6 +324,21 @@ static void pdf_guided_batch(const gsd_view *v, const queries *q, uint32_t at, u
 {
     find_batch(v, q, at, n, r);
     gsd_pdf_batch(v, n, NULL, r->handle, &q->guided[3 * at], 12, r->pdf);
+}
+
+static void find_product(const gsd_view *v, const queries *q, uint32_t at, uint32_t n, results *r)
+{
+    gsd_find_batch(v, n, NULL, &q->position[3 * at], 12, &q->normal[3 * at], 12, NULL, 0, r->handle, NULL);
+}
+static void sample_product(const gsd_view *v, const queries *q, uint32_t at, uint32_t n, results *r)
+{
+    find_product(v, q, at, n, r);
+    gsd_sample_batch(v, n, NULL, r->handle, &q->u[2 * at], 8, r->direction, 12, r->pdf);
+}
+static void pdf_product(const gsd_view *v, const queries *q, uint32_t at, uint32_t n, results *r)
+{
+    find_product(v, q, at, n, r);
+    gsd_pdf_batch(v, n, NULL, r->handle, &q->uniform[3 * at], 12, r->pdf);
 }
 
 typedef void (*query_fn)(const gsd_view *v, const queries *q, uint32_t at, uint32_t n, results *r);
@@ -412,85 +435,209 @@ static void validate(const gsd_view *view, const queries *q, naive_space *root, 
 
 /* ---- microbenchmarks ---------------------------------------------------------------------------------------- */
 
-/* Mean numbers of dependent cache lines that a query touches after the 16 KB grid. */
-typedef struct lines {
-    double find, uniform, guided, depth_uniform, depth_guided;
-} lines;
+/* The distinct cache lines that a query touches, by array. */
+typedef struct touched {
+    uintptr_t line[1024]; /* since the last query, or the last cell */
+    uint32_t count;
+    double lines[AREAS];
+} touched;
 
-static lines count_lines(const gsd_view *view, const queries *q, naive_space *root)
+static void touch(touched *t, int area, const void *data, size_t size)
 {
-    lines l = {0, 0, 0, 0, 0};
-    uint32_t n = q->count < 65536 ? q->count : 65536;
-    for (uint32_t i = 0; i < n; ++i) {
-        double x, y;
-        const naive_space *s = naive_find(root, &q->position_d[3 * i]);
-        uint32_t level = view->cells[s->cell].level;
-        l.find += (double)(level > 12 ? level - 12 : 0) + 1;
-        naive_unit_square(&q->uniform_d[3 * i], &x, &y);
-        l.depth_uniform += naive_depth(s->sampling, x, y);
-        l.uniform += fmax(naive_depth(s->sampling, x, y) - 3, 0) + 2; /* table of three levels, then nodes */
-        naive_unit_square(&q->guided_d[3 * i], &x, &y);
-        l.depth_guided += naive_depth(s->sampling, x, y);
-        l.guided += fmax(naive_depth(s->sampling, x, y) - 3, 0) + 2;
+    for (uintptr_t line = (uintptr_t)data / 64; line <= ((uintptr_t)data + size - 1) / 64; ++line) {
+        uint32_t i = 0;
+        while (i < t->count && t->line[i] != line)
+            ++i;
+        if (i < t->count)
+            continue;
+        if (t->count < 1024)
+            t->line[t->count++] = line;
+        t->lines[area]++;
     }
-    l.find /= n;
-    l.uniform /= n;
-    l.guided /= n;
-    l.depth_uniform /= n;
-    l.depth_guided /= n;
-    return l;
 }
 
-static void bench_levels(const options *o, const gsd_view *view, const queries *q, const machine *m, const lines *l,
+static void touch_find(touched *t, const gsd_view *v, const float *position)
+{
+    uint32_t g[3], link, level = 12;
+    for (int k = 0; k < 3; ++k)
+        g[k] = gsd_grid_coordinate(position[k], v->origin[k], v->scale);
+    const uint32_t *entry = &v->grid[(g[0] >> 20) << 8 | (g[1] >> 20) << 4 | g[2] >> 20];
+    touch(t, AREA_SPACE, entry, sizeof *entry);
+    for (link = *entry; !(link & GSD_CELL_BIT); ++level) {
+        entry = &v->spatial[link + (g[level % 3] >> (23 - level / 3) & 1)];
+        touch(t, AREA_SPACE, entry, sizeof *entry);
+        link = *entry;
+    }
+    touch(t, AREA_SPACE, &v->cells[link & ~GSD_CELL_BIT], sizeof *v->cells);
+}
+
+/* From a node of this depth to the leaf of a direction. */
+static void touch_path(touched *t, const gsd_view *v, uint32_t node, uint32_t depth, const float *direction)
+{
+    uint32_t x, y, child;
+    gsd_coordinates(direction, &x, &y);
+    touch(t, AREA_NODES, &v->nodes[node], sizeof *v->nodes);
+    while ((child = v->nodes[node].inner.child) != 0) {
+        ++depth;
+        node = child + (x >> (24 - depth) & 1) + 2 * (y >> (24 - depth) & 1);
+        touch(t, AREA_NODES, &v->nodes[node], sizeof *v->nodes);
+    }
+}
+
+static void touch_jump(touched *t, const gsd_view *v, const gsd_handle *h, const float *direction)
+{
+    uint32_t x, y;
+    gsd_coordinates(direction, &x, &y);
+    const uint32_t *jump = &v->jumps[h->jump + (y >> 21) * 8 + (x >> 21)];
+    touch(t, AREA_JUMPS, jump, sizeof *jump);
+    touch_path(t, v, *jump, 3, direction);
+}
+
+static void touch_slot(touched *t, const gsd_view *v, const gsd_handle *h, const float *u)
+{
+    double r[2], e = (double)v->uniform;
+    gsd_extend_random(u, r);
+    double slot = (r[0] - e) / (1 - e) * h->alias_count;
+    const gsd_alias *a = &v->aliases[h->alias + (uint32_t)fmin(fmax(slot, 0), h->alias_count - 1.0)];
+    touch(t, AREA_ALIASES, a, sizeof *a);
+    touch(t, AREA_NODES, &v->nodes[slot - floor(slot) < (double)a->threshold ? a->node : a->other], sizeof *v->nodes);
+}
+
+enum { QUERY_FIND, QUERY_SAMPLE, QUERY_PDF, QUERY_GUIDED, QUERY_FIND_PRODUCT, QUERY_SAMPLE_PRODUCT, QUERY_PDF_PRODUCT };
+
+/* Mean numbers of distinct lines of a query; where sorted, of those that no query of the same cell has touched. */
+static void count_lines(const gsd_view *v, const queries *q, int kind, bool sorted, double lines[AREAS])
+{
+    touched *t = allocate(1, sizeof *t);
+    uint32_t n = sorted || q->count < 65536 ? q->count : 65536, cell = GSD_CELL_BIT;
+    bool product = kind >= QUERY_FIND_PRODUCT;
+    for (uint32_t i = 0; i < n; ++i) {
+        float direction[3];
+        gsd_handle h = gsd_find(v, &q->position[3 * i], product ? &q->normal[3 * i] : NULL, NULL);
+        t->count = sorted && h.cell == cell ? t->count : 0;
+        cell = h.cell;
+        touch_find(t, v, &q->position[3 * i]);
+        if (product && h.product > 0)
+            touch(t, AREA_MASSES, &v->masses[h.jump], GSDI_BINS * sizeof *v->masses);
+        gsd_sample(v, &h, &q->u[2 * i], direction);
+        if (kind == QUERY_SAMPLE && h.alias_count)
+            touch_slot(t, v, &h, &q->u[2 * i]);
+        else if (kind == QUERY_SAMPLE)
+            touch_path(t, v, h.root, 0, direction);
+        else if (kind == QUERY_SAMPLE_PRODUCT)
+            touch_jump(t, v, &h, direction);
+        else if (kind == QUERY_PDF || kind == QUERY_PDF_PRODUCT)
+            touch_jump(t, v, &h, &q->uniform[3 * i]);
+        else if (kind == QUERY_GUIDED)
+            touch_jump(t, v, &h, &q->guided[3 * i]);
+    }
+    for (int k = 0; k < AREAS; ++k)
+        lines[k] = t->lines[k] / n;
+    free(t);
+}
+
+typedef struct query_row {
+    const char *name;
+    query_fn fn;
+    int kind;
+    bool single, sorted, alias;
+    double target;
+} query_row;
+
+static const query_row query_rows[] = {
+    {"find, one by one", find_scalar, QUERY_FIND, true, false, false, 0},
+    {"find, batched", find_batch, QUERY_FIND, false, false, false, 0},
+    {"find + sample, one by one", sample_scalar, QUERY_SAMPLE, true, false, false, 0},
+    {"find + sample, batched", sample_batch, QUERY_SAMPLE, false, false, false, 60},
+    {"find + sample, alias, one by one", sample_scalar, QUERY_SAMPLE, true, false, true, 0},
+    {"find + sample, alias, batched", sample_batch, QUERY_SAMPLE, false, false, true, 25},
+    {"find + sample, sorted, batched", sample_batch, QUERY_SAMPLE, false, true, false, 0},
+    {"find + sample, sorted, alias, batched", sample_batch, QUERY_SAMPLE, false, true, true, 0},
+    {"find + pdf, one by one", pdf_scalar, QUERY_PDF, true, false, false, 0},
+    {"find + pdf, batched", pdf_batch, QUERY_PDF, false, false, false, 95},
+    {"find + pdf of guided directions, batched", pdf_guided_batch, QUERY_GUIDED, false, false, false, 0},
+    {"find + pdf, sorted, one by one", pdf_scalar, QUERY_PDF, true, true, false, 0},
+    {"find + pdf, sorted, batched", pdf_batch, QUERY_PDF, false, true, false, 40},
+    {"find with product, batched", find_product, QUERY_FIND_PRODUCT, false, false, false, 0},
+    {"find + sample with product, batched", sample_product, QUERY_SAMPLE_PRODUCT, false, false, false, 0},
+    {"find + pdf with product, batched", pdf_product, QUERY_PDF_PRODUCT, false, false, false, 0},
+};
+
+/* Of the time: lines of each array times that of a random load there, one after another or independent. */
+static double lines_ns(const machine *m, const double lines[AREAS], bool single)
+{
+    double ns = 0;
+    for (int k = 0; k < AREAS; ++k)
+        ns += lines[k] * (single ? m->latency : m->throughput)[k];
+    return ns;
+}
+
+static void bench_levels(const options *o, const gsd_view *view, const queries *q, const machine *m,
                          const double *naive)
 {
     static const char *level_name[] = {"", "scalar", "AVX2", "AVX-512"};
-    for (uint32_t level = GSD_SIMD_SCALAR; level < view->simd; ++level) {
-        char name[64];
-        gsd_view v = *view;
-        v.simd = level;
-        snprintf(name, sizeof name, "find + sample, batched, %s", level_name[level]);
-        row(name, time_queries(o, sample_batch, &v, q), m->throughput * (l->find + l->depth_guided + 1), naive[1], 0);
-        snprintf(name, sizeof name, "find + pdf, batched, %s", level_name[level]);
-        row(name, time_queries(o, pdf_batch, &v, q), m->throughput * (l->find + l->uniform), naive[2], 0);
+    for (uint32_t level = GSD_SIMD_SCALAR; level < view->simd; ++level)
+        for (size_t i = 0; i < sizeof query_rows / sizeof *query_rows; ++i) {
+            const query_row *w = &query_rows[i];
+            char name[64];
+            double lines[AREAS];
+            gsd_view v = *view;
+            v.simd = level;
+            if (w->single || w->sorted || w->alias || (w->kind != QUERY_SAMPLE && w->kind != QUERY_PDF))
+                continue;
+            snprintf(name, sizeof name, "%s, %s", w->name, level_name[level]);
+            count_lines(view, q, w->kind, false, lines);
+            row(name, time_queries(o, w->fn, &v, q), lines_ns(m, lines, false), naive[w->kind], 0);
+        }
+}
+
+/* With the product, batches and single queries must agree bit by bit. */
+static void validate_product(const gsd_view *v, const queries *q)
+{
+    results *r = allocate(1, sizeof *r);
+    uint32_t wrong = 0;
+    pdf_product(v, q, 0, BATCH, r);
+    for (uint32_t i = 0; i < BATCH; ++i) {
+        gsd_handle h = gsd_find(v, &q->position[3 * i], &q->normal[3 * i], NULL);
+        wrong += gsd_pdf(v, &h, &q->uniform[3 * i]) != r->pdf[i];
     }
+    free(r);
+    if (wrong)
+        fail("batches with the product do not agree with single queries");
 }
 
 static void bench_queries(const options *o, const gsd_view *v, const gsd_view *alias, const queries *q,
                           const queries *sorted, naive_space *root, const machine *m)
 {
-    lines l = count_lines(v, q, root);
     double naive[4], naive_sorted[4];
     for (int i = 0; i < 4; ++i) {
         naive[i] = time_naive(o, root, q, i);
         naive_sorted[i] = time_naive(o, root, sorted, i);
     }
-    double monotone = l.find + l.depth_guided + 1, table = l.find + 2, random = l.find + l.uniform;
-    printf(
-        "mean levels: space %.1f below the grid, quadtree %.1f in guided and %.1f in uniform directions\n"
-        "limit: cache lines that depend on each other, times: one by one, the latency of a random load in a block of\n"
-        "       the field's size (%.1f ns); batched, the time of independent loads there (%.1f ns); sorted, in cache\n"
-        "       (%.1f ns)\n\n",
-        l.find - 1, l.depth_guided, l.depth_uniform, m->latency, m->throughput, m->cached);
+    validate_product(v, q);
+    printf("limit: as many random loads as a query touches distinct cache lines (where sorted: lines that no query of "
+           "the\n"
+           "       same cell has touched) in blocks of the arrays' sizes, one after another for one by one, else\n"
+           "       independent, ns:\n");
+    for (int k = 0; k < AREAS; ++k)
+        printf("       %-30s %6.1f, independent %5.1f\n", area_name[k], m->latency[k], m->throughput[k]);
+    printf("lines: in these arrays; naive: without the product\n\n");
     row_titles("ns per query");
-    row("find, one by one", time_queries(o, find_scalar, v, q), m->latency * l.find, naive[0], 0);
-    row("find, batched", time_queries(o, find_batch, v, q), m->throughput * l.find, naive[0], 0);
-    row("find + sample, one by one", time_queries(o, sample_scalar, v, q), m->latency * monotone, naive[1], 0);
-    row("find + sample, batched", time_queries(o, sample_batch, v, q), m->throughput * monotone, naive[1], 60);
-    row("find + sample, alias, one by one", time_queries(o, sample_scalar, alias, q), m->latency * table, naive[1], 0);
-    row("find + sample, alias, batched", time_queries(o, sample_batch, alias, q), m->throughput * table, naive[1], 25);
-    row("find + sample, sorted, batched", time_queries(o, sample_batch, v, sorted), m->cached * monotone,
-        naive_sorted[1], 0);
-    row("find + sample, sorted, alias, batched", time_queries(o, sample_batch, alias, sorted), m->cached * table,
-        naive_sorted[1], 0);
-    row("find + pdf, one by one", time_queries(o, pdf_scalar, v, q), m->latency * random, naive[2], 0);
-    row("find + pdf, batched", time_queries(o, pdf_batch, v, q), m->throughput * random, naive[2], 95);
-    row("find + pdf of guided directions, batched", time_queries(o, pdf_guided_batch, v, q),
-        m->throughput * (l.find + l.guided), naive[3], 0);
-    row("find + pdf, sorted, one by one", time_queries(o, pdf_scalar, v, sorted), m->cached * random, naive_sorted[2],
-        0);
-    row("find + pdf, sorted, batched", time_queries(o, pdf_batch, v, sorted), m->cached * random, naive_sorted[2], 40);
-    bench_levels(o, v, q, m, &l, naive);
+    for (size_t i = 0; i < sizeof query_rows / sizeof *query_rows; ++i) {
+        const query_row *w = &query_rows[i];
+        const gsd_view *view = w->alias ? alias : v;
+        const queries *what = w->sorted ? sorted : q;
+        int like = w->kind >= QUERY_FIND_PRODUCT ? w->kind - QUERY_FIND_PRODUCT : w->kind;
+        double lines[AREAS], all = 0;
+        count_lines(view, what, w->kind, w->sorted, lines);
+        row(w->name, time_queries(o, w->fn, view, what), lines_ns(m, lines, w->single),
+            (w->sorted ? naive_sorted : naive)[like], w->target);
+        for (int k = 0; k < AREAS; ++k)
+            all += lines[k];
+        printf("    %.1f lines: %.1f + %.1f + %.1f + %.1f + %.1f\n", all, lines[0], lines[1], lines[2], lines[3],
+               lines[4]);
+    }
+    bench_levels(o, v, q, m, naive);
 }
 
 /* ---- learning ----------------------------------------------------------------------------------------------- */
@@ -606,9 +753,12 @@ static void bench_learning(const options *o, const machine *m)
 {
     static const struct {
         gsd_target target;
+        gsd_denoise_mode denoise;
+        double goal;
         const char *name;
-    } kind[] = {{GSD_TARGET_RADIANCE, "record + accumulate + refine, radiance"},
-                {GSD_TARGET_SWITCHING, "record + accumulate + refine, switching"}};
+    } kind[] = {{GSD_TARGET_RADIANCE, GSD_DENOISE_DEFAULT, 80, "record + accumulate + refine, radiance"},
+                {GSD_TARGET_RADIANCE, GSD_DENOISE_OFF, 0, "record + accumulate + refine, denoise off"},
+                {GSD_TARGET_SWITCHING, GSD_DENOISE_DEFAULT, 80, "record + accumulate + refine, switching"}};
     int log2n = o->quick ? 18 : 22;
     printf(
         "\nlearning SF1, 2^%d samples in %d updates; limit: four passes over the 48 bytes of a sample at %.1f GB/s\n",
@@ -619,7 +769,7 @@ static void bench_learning(const options *o, const machine *m)
     gsd_desc resolved;
     check(gsd_resolve(&o->desc, &resolved), "resolve");
     naive_learner naive = naive_create(1000, (double)resolved.rho);
-    for (int k = 0; k < 2; ++k) {
+    for (int k = 0; k < 3; ++k) {
         gsd_stats stats;
         double best = 1e30, times[5];
         learning t, fastest = {0, 0, 0, 1};
@@ -627,6 +777,7 @@ static void bench_learning(const options *o, const machine *m)
         for (int repeat = 0; repeat < repeats; ++repeat) {
             gsd_desc desc = o->desc;
             desc.target = kind[k].target;
+            desc.denoise = kind[k].denoise;
             bool first = k == 0 && repeat == 0;
             gsd_field *field = learn(&desc, log2n, 1, &t, first ? &naive : NULL, &naive_ns);
             naive_ns *= first ? 1e9 / (double)t.samples : 1; /* were seconds */
@@ -639,7 +790,7 @@ static void bench_learning(const options *o, const machine *m)
             gsd_get_stats(field, &stats);
             gsd_destroy(field);
         }
-        row(kind[k].name, bench_summary(times, repeats), 4 * 48 / m->bandwidth, naive_ns, 80);
+        row(kind[k].name, bench_summary(times, repeats), 4 * 48 / m->bandwidth, naive_ns, kind[k].goal);
         printf("    record %.1f, accumulate %.1f, refine %.1f ns/sample; %u cells, %.0f nodes and %.0f bytes per cell, "
                "%.1f bytes per node; mean depth %.1f\n",
                fastest.record / (double)fastest.samples * 1e9, fastest.accumulate / (double)fastest.samples * 1e9,
@@ -771,11 +922,19 @@ static void run_micro(const options *o)
     gsd_view view = gsd_get_view(field), alias = gsd_get_view(alias_field);
     static const uint32_t zero[3] = {0, 0, 0};
     gsd_get_stats(field, &stats);
-    uint64_t bytes = 16 * stats.nodes + 32 * (uint64_t)stats.cells + 256 * (uint64_t)stats.trees;
-    machine m = {bench_load_latency((size_t)bytes), bench_load_throughput((size_t)bytes),
-                 bench_load_throughput((size_t)1 << 18), bench_read_bandwidth()};
-    printf("field: %u cells, %.0f nodes each; sampling part about %.1f MB, both parts %.1f MB: %.0f bytes per cell\n",
-           stats.cells, (double)stats.nodes / stats.cells, (double)bytes * 1e-6, (double)stats.bytes * 1e-6,
+    const gsdi_block *b = field->block, *ab = alias_field->block;
+    size_t area[AREAS] = {4 * (GSDI_GRID + (size_t)b->spatial) + sizeof(gsd_cell) * b->cells,
+                          sizeof(gsd_node) * (size_t)b->nodes, 4 * (size_t)b->jumps, 4 * (size_t)b->jumps,
+                          sizeof(gsd_alias) * (size_t)ab->aliases};
+    machine m;
+    for (int k = 0; k < AREAS; ++k) {
+        m.latency[k] = bench_load_latency(area[k]);
+        m.throughput[k] = bench_load_throughput(area[k]);
+    }
+    m.cached = bench_load_throughput((size_t)1 << 18);
+    m.bandwidth = bench_read_bandwidth();
+    printf("field: %u cells, %.0f nodes each; sampling part %.1f MB, both parts %.1f MB: %.0f bytes per cell\n",
+           stats.cells, (double)stats.nodes / stats.cells, (double)b->size * 1e-6, (double)stats.bytes * 1e-6,
            (double)stats.bytes / stats.cells);
     queries q = make_queries(o->queries, &view), sorted = sorted_queries(&q, &view);
     naive_space *root = naive_copy_field(field, &view, zero, 0);

@@ -1644,8 +1644,11 @@ static void test_box_filter_matches_brute_force(void **state)
         x = round % 5 == 0 ? (uint32_t)round : round % 5 == 1 ? 16777215u - (uint32_t)round : x;
         y = round % 3 == 0 ? (uint32_t)round * 3 : round % 3 == 1 ? 16777215u - (uint32_t)round * 7 : y;
         assert_true(gsdi_import_convert(&t, 16, child, mass, scratch) >= 0);
-        gsdi_building_leaf(child, x, y, &depth);
-        gsdi_splat_box(child, halves, round & 1, x, y, 3.0);
+        gsdi_map map;
+        gsdi_map_make(&map, child, halves, (uint32_t)round * 8); /* more samples: more levels unfolded */
+        depth = 24;
+        gsdi_map_node(&map, x, y, &depth);
+        gsdi_splat_box(&map, round & 1, x, y, 3.0);
         for (int i = 0; i < 400; ++i) {
             sum[i] = halves[i].half[round & 1];
             assert_true(halves[i].half[!(round & 1)] == 0);
