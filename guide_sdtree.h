@@ -1788,6 +1788,11 @@ static inline void gsdi_gauss_mark(uint64_t *row, uint32_t first, uint32_t end)
     row[last] |= high;
 }
 
+/* A square region of a quadtree: node, lowest corner, side. */
+typedef struct gsdi_square {
+    uint32_t node, x, y, size;
+} gsdi_square;
+
 /* Map of the blocks in which the window of any element reaches beyond its leaf; layer >= 5. A
    square of 16 or more that is a leaf is active along its frame; one of 8 is active whether it is divided or not, so
    that nothing below needs a look. */
