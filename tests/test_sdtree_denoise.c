@@ -419,8 +419,10 @@ static void test_any_threads_give_the_same_field(void **state)
 static void leaf_depths(const gsd_field *f, unsigned char depth[64 * 64])
 {
     for (uint32_t i = 0; i < 64 * 64; ++i) {
-        uint32_t d, x = (2 * (i % 64) + 1) << 17, y = (2 * (i / 64) + 1) << 17;
-        gsdi_building_leaf(f->child + f->states[0].first, x, y, &d);
+        const uint32_t *child = f->child + f->states[0].first;
+        uint32_t x = (2 * (i % 64) + 1) << 17, y = (2 * (i / 64) + 1) << 17, node = 0, d = 0;
+        for (; child[node]; ++d)
+            node = child[node] + (x >> (23 - d) & 1u) + 2 * (y >> (23 - d) & 1u);
         depth[i] = (unsigned char)d;
     }
 }
