@@ -267,8 +267,8 @@ typedef struct gsd_desc {
     bool no_guide_weight; /* second-moment targets: w = 1 */
     bool no_history;      /* clear the sums in every refine; see HOW IT WORKS */
     gsd_denoise_mode denoise;
-    float denoise_budget;   /* leaves that refine may blur, for each sample so far and beyond 32,768; 0.001 .. 1e6;
-                               default 0.15: about 10 ns a sample */
+    float denoise_budget;   /* leaves that refine may blur, for each sample so far and beyond 131,072; 0.001 .. 1e6;
+                               default 0.25: at most 15 to 20 ns a sample */
     float gaussian_sigma;   /* of GSD_DENOISE_GAUSSIAN, in elements of a layer's matrix, 0.1 .. 100; default 0.8 */
     float gaussian_rho;     /* as rho, of the trees it makes, 1e-5 .. 1; default 0: rho */
     bool gaussian_sphere;   /* phi wraps and poles are crossed; the thesis has zeros outside the matrix */
@@ -1002,12 +1002,12 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_SPLIT 2.0            /* a cell splits above that times sqrt(samples held): tuned on SF1 (1 .. 2), ajar */
 #define GSDI_MIN_SPLIT 32.0       /* at least */
 #define GSDI_LIT                                                                                                       \
-    24.0                     /* ... times its share of non-zero samples: parts of a dark cell would know too little;   \
-                                tuned on lamps, ajar (8 .. 32) */
-#define GSDI_BLUR_EVEN 0.05  /* share of evenness in the density that one half of the samples says of the other */
-#define GSDI_BLUR_MOST 0.6   /* of the way towards the surroundings, for one half */
-#define GSDI_BLUR_STEPS 5    /* halvings of the interval that holds the best blur */
-#define GSDI_BLUR_FREE 32768 /* leaves that are blurred whatever the budget */
+    24.0                      /* ... times its share of non-zero samples: parts of a dark cell would know too little;  \
+                                 tuned on lamps, ajar (8 .. 32) */
+#define GSDI_BLUR_EVEN 0.05   /* share of evenness in the density that one half of the samples says of the other */
+#define GSDI_BLUR_MOST 0.6    /* of the way towards the surroundings, for one half */
+#define GSDI_BLUR_STEPS 5     /* halvings of the interval that holds the best blur */
+#define GSDI_BLUR_FREE 131072 /* leaves that are blurred whatever the budget */
 #define GSDI_MAX_CELLS (1u << 26)
 
 /* ---- >>memory ----------------------------------------------------------------------------------------------- */
@@ -4304,7 +4304,7 @@ GSD_API gsd_result gsd_resolve(const gsd_desc *desc, gsd_desc *resolved)
     d.directional_filter = d.directional_filter ? d.directional_filter : GSD_DIRECTIONAL_BOX;
     d.alpha_mode = d.alpha_mode ? d.alpha_mode : GSD_ALPHA_GRID;
     d.denoise = d.denoise ? d.denoise : GSD_DENOISE_BLUR;
-    gsdi_default_float(&d.denoise_budget, 0.15f);
+    gsdi_default_float(&d.denoise_budget, 0.25f);
     gsdi_default_float(&d.switch_after, 4);
     gsdi_default_float(&d.rho, 0.01f);
     gsdi_default_float(&d.gaussian_sigma, 0.8f);
