@@ -2929,7 +2929,7 @@ static void gsdi_gate_scale(gsdi_state *s, double f)
 static double gsdi_gate_effective(const gsdi_state *s)
 {
     double v = s->v[GSDI_GATE_LOW], vv = s->vv[GSDI_GATE_LOW];
-    return vv > 0 ? v * v / vv : 0;
+    return vv > 0 ? fmin(v * v / vv, 1e18) : 0; /* sums of a loaded field may be anything */
 }
 
 /* alpha from the five V(a), a convex function of a: the minimum of the parabola through the lowest point and its
@@ -5423,14 +5423,14 @@ GSD_API gsd_result gsd_load(const gsd_desc *desc, const void *data, size_t size,
 static bool gsdi_share_ok(float x) { return x >= 0 && x <= 1; }
 
 /* One sampling tree: children in its own range, each group used once and later than its parent, leaves where their
-   path says. */
+   path says, depths as they are. */
 static bool gsdi_tree_ok(const gsd_view *view, const gsdi_block *b, const gsdi_tree *tree, uint32_t max_depth)
 {
     gsdi_visit stack[GSDI_STACK];
-    uint32_t used = 0, k;
+    uint32_t used = 0, deepest = 0, k;
     int top = 0;
     if (tree->groups == 0)
-        return tree->root == 0 && tree->jump == 0;
+        return tree->root == 0 && tree->jump == 0 && tree->max_depth == 0;
     if (tree->root < 4 || tree->root >= b->roots || tree->first < b->roots || (tree->first - b->roots) % 4 ||
         (uint64_t)tree->first + (uint64_t)tree->groups * 4 > b->nodes)
         return false;
@@ -5442,6 +5442,7 @@ static bool gsdi_tree_ok(const gsd_view *view, const gsdi_block *b, const gsdi_t
         if (n->inner.child == 0) {
             if (!(n->leaf.pdf > 0) || !(n->leaf.pdf < 1e30f) || n->leaf.x != (v.x | v.depth << 24) || n->leaf.y != v.y)
                 return false;
+            deepest = v.depth > deepest ? v.depth : deepest;
             continue;
         }
         if (n->inner.child != tree->first + used * 4 || used >= tree->groups || v.depth >= max_depth ||
@@ -5456,7 +5457,8 @@ static bool gsdi_tree_ok(const gsd_view *view, const gsdi_block *b, const gsdi_t
             s->y = v.y + (k >> 1) * (16777216u >> s->depth);
         }
     }
-    return used == tree->groups;
+    return used == tree->groups && deepest == tree->max_depth &&
+           gsdi_within((double)tree->mean_depth, 0, deepest + 0.001);
 }
 
 static bool gsdi_jumps_ok(const gsd_view *view, const gsdi_block *b, const gsdi_tree *tree)
