@@ -31,8 +31,9 @@ typedef struct path {
     bool specular;  /* the last bounce was a delta one, or there was none */
     bool seen;      /* a non-delta vertex has been met */
     int x, y;
-    int last;       /* newest link, -1 = none */
-    int root, join; /* the camera path that it belongs to; link of the path it was split from, -1 = none */
+    int last;  /* newest link, -1 = none */
+    int root;  /* the camera path that it belongs to */
+    int trail; /* of the worker's trails, while recording */
 } path;
 
 /* A path vertex, kept for the way back. */
@@ -47,10 +48,17 @@ typedef struct link {
     bool environment;
 } link;
 
+/* What is left of a path for the way back. */
+typedef struct trail {
+    int last; /* newest link, -1 = none */
+    int join; /* link of the path it was split from, -1 = none */
+} trail;
+
 struct tr_worker {
     tr_counters counters;
     path paths[TR_PATHS];
-    int path_count; /* camera paths first, then what was split off */
+    int camera_count, path_count;   /* slots in use so far: camera paths first, then what was split off */
+    int free[TR_PATHS], free_count; /* slots of split paths that have ended */
     int active[TR_PATHS], active_count;
     struct RTCRayHit hits[TR_PATHS];
     tr_surface surfaces[TR_PATHS];
@@ -71,7 +79,8 @@ struct tr_worker {
     /* way back */
     tr_vertex *vertices;
     link *links;
-    int vertex_count, vertex_capacity, link_count, link_capacity;
+    trail *trails; /* in order of creation: a path before what was split from it */
+    int vertex_count, vertex_capacity, link_count, link_capacity, trail_count, trail_capacity;
 };
 
 #define WORKER_PAGE ((size_t)1 << 21) /* fill a large page, so that all of a worker is one page away */
@@ -97,6 +106,7 @@ void tr_worker_destroy(tr_worker *w)
     free(w->handles);
     free(w->vertices);
     free(w->links);
+    free(w->trails);
     free(w);
 }
 
@@ -122,6 +132,14 @@ static bool reserve(tr_worker *w, bool recording)
             return false;
         w->links = grown;
         w->link_capacity = capacity;
+    }
+    if (w->trail_count + TR_PATHS > w->trail_capacity) {
+        int capacity = w->trail_capacity ? 2 * w->trail_capacity : 4 * TR_PATHS;
+        trail *grown = realloc(w->trails, sizeof *grown * (size_t)capacity);
+        if (!grown)
+            return false;
+        w->trails = grown;
+        w->trail_capacity = capacity;
     }
     return true;
 }
@@ -184,7 +202,7 @@ static void start_paths(tr_worker *w, const tr_frame *frame, int tile, int sampl
     int x0 = tile % frame->tiles_x * TR_TILE_W, y0 = tile / frame->tiles_x * TR_TILE_H;
     int x1 = x0 + TR_TILE_W < frame->width ? x0 + TR_TILE_W : frame->width;
     int y1 = y0 + TR_TILE_H < frame->height ? y0 + TR_TILE_H : frame->height;
-    w->active_count = w->vertex_count = w->link_count = 0;
+    w->active_count = w->vertex_count = w->link_count = w->trail_count = 0;
     for (int y = y0; y < y1; ++y)
         for (int x = x0; x < x1; ++x) {
             path *p = &w->paths[w->active_count];
@@ -201,13 +219,13 @@ static void start_paths(tr_worker *w, const tr_frame *frame, int tile, int sampl
             p->seen = false;
             p->x = x;
             p->y = y;
-            p->last = p->join = -1;
+            p->last = p->trail = -1;
             p->root = w->active_count;
             camera_ray(frame, p);
             w->active[w->active_count] = w->active_count;
             w->active_count++;
         }
-    w->path_count = w->active_count;
+    w->camera_count = w->path_count = w->active_count;
     w->counters.paths += (uint64_t)w->active_count;
 }
 
@@ -277,6 +295,11 @@ static link *push_link(tr_worker *w, path *p)
     l->previous = p->last;
     l->vertex = -1;
     p->last = w->link_count++;
+    if (p->trail < 0) {
+        p->trail = w->trail_count++;
+        w->trails[p->trail].join = -1;
+    }
+    w->trails[p->trail].last = p->last;
     return l;
 }
 
@@ -529,20 +552,25 @@ static float expectation(const tr_worker *w, const tr_frame *frame, int id)
 static void split_path(tr_worker *w, const tr_frame *frame, int id, int n, bool recording)
 {
     const tr_method *method = frame->method;
-    int from = w->place[id], room = TR_PATHS - w->path_count;
+    int from = w->place[id], room = w->free_count + TR_PATHS - w->path_count;
+    if (room > TR_PATHS - w->smooth_count) /* places of paths that roulette has ended are not used again */
+        room = TR_PATHS - w->smooth_count;
+    w->counters.unsplit_paths += n - 1 < room ? 0 : (uint64_t)(n - 1 - room);
     n = n - 1 < room ? n : room + 1;
     w->paths[id].roulette = 1 / (float)n;
     for (int i = 1; i < n; ++i) {
-        int copy = w->path_count++, k = w->smooth_count++;
+        int copy = w->free_count ? w->free[--w->free_count] : w->path_count++, k = w->smooth_count++;
         path *p = &w->paths[copy];
         *p = w->paths[id];
-        uint64_t seed = (uint64_t)rng_u32(&w->paths[id].guide_rng) << 32 | rng_u32(&w->paths[id].guide_rng);
+        uint64_t seed = (uint64_t)rng_u32(&w->paths[id].guide_rng) << 32;
+        seed |= rng_u32(&w->paths[id].guide_rng);
         p->rng = rng_seed(seed, 0);
         p->guide_rng = rng_seed(seed, 1);
-        p->join = p->last;
-        p->last = -1;
-        if (recording)
+        p->last = p->trail = -1;
+        if (recording) {
             push_link(w, p);
+            w->trails[p->trail].join = w->paths[id].last;
+        }
         w->surfaces[copy] = w->surfaces[id];
         w->closures[copy] = w->closures[id];
         w->place[copy] = k;
@@ -557,6 +585,19 @@ static void split_path(tr_worker *w, const tr_frame *frame, int id, int n, bool 
         w->active[w->active_count++] = copy;
     }
     w->counters.split_paths += (uint64_t)(n - 1);
+}
+
+/* The slots of split paths that are not active any more. */
+static void find_free_slots(tr_worker *w)
+{
+    bool alive[TR_PATHS];
+    memset(alive, 0, (size_t)w->path_count * sizeof *alive);
+    for (int i = 0; i < w->active_count; ++i)
+        alive[w->active[i]] = true;
+    w->free_count = 0;
+    for (int id = w->path_count; id-- > w->camera_count;)
+        if (!alive[id])
+            w->free[w->free_count++] = id;
 }
 
 /* Paths that are expected to add little are ended by chance, paths that are expected to add much go on as several. */
@@ -575,6 +616,7 @@ static void guided_roulette(tr_worker *w, const tr_frame *frame, bool recording)
         w->active[kept++] = id;
     }
     w->active_count = kept;
+    find_free_slots(w);
     for (int i = 0; i < kept; ++i)
         if (count[i] > 1)
             split_path(w, frame, w->active[i], count[i], recording);
@@ -768,10 +810,10 @@ static void scatter(tr_worker *w, const tr_frame *frame, bool recording)
    they were split from: what they bring is reflected there. */
 static void carry_back(tr_worker *w)
 {
-    for (int id = w->path_count; id-- > 0;) {
+    for (int t = w->trail_count; t-- > 0;) {
         vec3 incident = v3s(0);
         const link *next = NULL;
-        for (int at = w->paths[id].last; at >= 0; at = w->links[at].previous) {
+        for (int at = w->trails[t].last; at >= 0; at = w->links[at].previous) {
             const link *l = &w->links[at];
             if (l->vertex >= 0) {
                 tr_vertex *v = &w->vertices[l->vertex];
@@ -784,8 +826,8 @@ static void carry_back(tr_worker *w)
             incident = add3(l->emitted, add3(l->reflected, mul3(l->weight, incident)));
             next = l;
         }
-        if (w->paths[id].join >= 0) {
-            link *from = &w->links[w->paths[id].join];
+        if (w->trails[t].join >= 0) {
+            link *from = &w->links[w->trails[t].join];
             from->reflected = add3(from->reflected, incident);
         }
     }

@@ -34,7 +34,7 @@ typedef struct tr_frame {
 
 typedef struct tr_counters {
     double trace, record, query, total; /* seconds on the worker's clock */
-    uint64_t rays, shadow_rays, paths, bad_samples, guided_vertices, vertices, split_paths;
+    uint64_t rays, shadow_rays, paths, bad_samples, guided_vertices, vertices, split_paths, unsplit_paths;
     bool out_of_memory;
 } tr_counters;
 

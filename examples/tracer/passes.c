@@ -14,7 +14,7 @@
 
 #define MAX_GROUPS 32
 #define GROWTH 4              /* a learning pass is 1 / GROWTH of all before it */
-#define ROUND_PATHS (1 << 17) /* paths between two flushes: bounds the memory of records */
+#define ROUND_PATHS (1 << 17) /* camera paths between two flushes: bounds the memory of records; each may be split */
 
 /* Passes that were sampled in the same way, or nearly so: plain sums are the best way to join them. */
 typedef struct group {
@@ -543,6 +543,7 @@ static bool collect(render_state *r)
         sum.shadow_rays += c->shadow_rays;
         sum.paths += c->paths;
         sum.split_paths += c->split_paths;
+        sum.unsplit_paths += c->unsplit_paths;
         sum.bad_samples += c->bad_samples;
         sum.out_of_memory |= c->out_of_memory;
     }
@@ -556,6 +557,7 @@ static bool collect(render_state *r)
     res->shadow_rays = sum.shadow_rays;
     res->paths = sum.paths;
     res->split_paths = sum.split_paths;
+    res->unsplit_paths = sum.unsplit_paths;
     res->bad_samples = sum.bad_samples;
     double total = 0;
     for (int i = 0; i < r->group_count; ++i)

@@ -255,6 +255,7 @@ static bool write_json(const char *path, const options *o, const tr_result *r, c
     json_number(f, "shadow_rays", (double)r->shadow_rays);
     json_number(f, "paths", (double)r->paths);
     json_number(f, "split_paths", (double)r->split_paths);
+    json_number(f, "unsplit_paths", (double)r->unsplit_paths);
     json_number(f, "bad_samples", (double)r->bad_samples);
     json_number(f, "samples", (double)r->method.samples);
     json_number(f, "refused", (double)r->method.refused);

@@ -544,8 +544,8 @@ typedef struct tr_result {
     double train_seconds; /* CPU seconds until the method had learned for the last time; what follows renders only */
     double trace_seconds, record_seconds, update_seconds, query_seconds; /* CPU seconds, of which shading is the rest */
     uint64_t rays, shadow_rays, paths;
-    uint64_t split_paths; /* that guided roulette added */
-    uint64_t bad_samples; /* NaN or infinite contributions dropped */
+    uint64_t split_paths, unsplit_paths; /* that guided roulette added; that it had no room for */
+    uint64_t bad_samples;                /* NaN or infinite contributions dropped */
     tr_method_stats method;
     struct tr_pass_result {
         int spp;
