@@ -267,8 +267,7 @@ typedef struct gsd_desc {
     bool no_guide_weight; /* second-moment targets: w = 1 */
     bool no_history;      /* clear the sums in every refine; see HOW IT WORKS */
     gsd_denoise_mode denoise;
-    float denoise_budget;   /* leaves that refine may blur, for each sample so far and beyond 131,072; 0.001 .. 1e6;
-                               default 0.25: at most 15 to 20 ns a sample */
+    float denoise_budget;   /* leaves blurred a sample, beyond 131,072 in all; 0.001 .. 1e6; default 0.25: <= 15 ns */
     float gaussian_sigma;   /* of GSD_DENOISE_GAUSSIAN, in elements of a layer's matrix, 0.1 .. 100; default 0.8 */
     float gaussian_rho;     /* as rho, of the trees it makes, 1e-5 .. 1; default 0: rho */
     bool gaussian_sphere;   /* phi wraps and poles are crossed; the thesis has zeros outside the matrix */
@@ -301,7 +300,7 @@ typedef struct gsd_training_sample {
 } gsd_training_sample;
 #define GSD_REJECTED (-0.0f)
 
-/* Optional facts about the pass that refine ends. */
+/* Optional facts about the pass that refine ends. Zero-initialise it. */
 typedef struct gsd_pass {
     bool pixel_estimate;      /* the pass's pixel_contributions were relative to a pixel estimate: see Gate */
     gsd_denoise_mode denoise; /* of this refine, in place of desc.denoise */
@@ -344,7 +343,7 @@ typedef struct gsd_stats {
     uint32_t waiting_cells;     /* last refine: too few new samples, tree kept */
     uint32_t unread_cells;      /* last refine: no new samples: no work done */
     uint32_t denoised_trees;    /* last refine: rebuilt and blurred */
-    uint32_t smooth_trees;      /* last refine: rebuilt, better without a blur by what their samples say */
+    uint32_t smooth_trees;      /* last refine: rebuilt, better without a blur by what their samples say, or one leaf */
     uint32_t over_budget_trees; /* last refine: rebuilt and left as they are, see desc.denoise_budget; Gaussian: over
                                    the limit of work, or no memory for them under max_bytes */
     uint32_t shallow_trees;     /* last refine, Gaussian: rebuilt and left as they are, nothing at layer 6 */
@@ -3456,10 +3455,11 @@ static void gsdi_denoise_range(void *context, uint32_t begin, uint32_t end)
 static uint32_t gsdi_building_leaves(const gsdi_state *s) { return s->count - (s->count - 1) / 4; }
 
 /* Choose the trees to denoise: all that are divided or, over the budget, an even selection that starts elsewhere in
-   every pass. */
-static void gsdi_denoise_choose(gsdi_refinement *r)
+   every pass. False = none. */
+static bool gsdi_denoise_choose(gsdi_refinement *r)
 {
     gsd_stats *stats = &r->stats;
+    bool any = false;
     uint32_t cells = r->field->block->cells, i, c = (uint32_t)((uint64_t)cells * (r->field->passes % 8) / 8);
     double allowed = GSDI_BLUR_FREE + (double)r->desc->denoise_budget * (double)stats->samples, needed = 0, due = 0;
     allowed = fmax(allowed - (double)stats->denoised_leaves, 0);
@@ -3477,7 +3477,9 @@ static void gsdi_denoise_choose(gsdi_refinement *r)
         due -= leaves;
         r->jobs[c].denoise = 1;
         stats->denoised_leaves += (uint64_t)leaves;
+        any = true;
     }
+    return any;
 }
 
 /* Move the masses of the old cells' building trees towards their surroundings. False = out of memory. */
@@ -3485,13 +3487,14 @@ static bool gsdi_denoise(gsdi_refinement *r, gsd_parallel_fn parallel, void *use
 {
     uint32_t cells = r->field->block->cells, i;
     double blur = 0;
-    r->blur_bytes = r->field->building_nodes * (uint64_t)GSDI_BLUR_FLOATS * sizeof(float);
-    r->blur = (float *)gsdi_allocate(r->desc, r->field->building_nodes, GSDI_BLUR_FLOATS * sizeof(float));
-    if (!r->blur)
-        return false;
-    gsdi_denoise_choose(r);
-    gsdi_run(parallel, user, cells, 16, gsdi_denoise_range, r);
-    gsdi_release(r->desc, r->blur);
+    if (gsdi_denoise_choose(r)) {
+        r->blur_bytes = r->field->building_nodes * (uint64_t)GSDI_BLUR_FLOATS * sizeof(float);
+        r->blur = (float *)gsdi_allocate(r->desc, r->field->building_nodes, GSDI_BLUR_FLOATS * sizeof(float));
+        if (!r->blur)
+            return false;
+        gsdi_run(parallel, user, cells, 16, gsdi_denoise_range, r);
+        gsdi_release(r->desc, r->blur);
+    }
     for (i = 0; i < cells; ++i) {
         r->stats.denoised_trees += r->jobs[i].blur > 0;
         blur += r->jobs[i].blur;
@@ -5667,6 +5670,7 @@ GSD_API gsd_result gsd_merge(gsd_field *field, const gsd_field *source)
             s->bins[k] = s->bins[k] <= 0xffffffffu - o->bins[k] ? s->bins[k] + o->bins[k] : 0xffffffffu;
     }
     field->stats.samples += source->stats.samples;
+    field->stats.denoised_leaves += source->stats.denoised_leaves;
     field->stats.zeros += source->stats.zeros;
     field->stats.rejected += source->stats.rejected;
     field->stats.refused += source->stats.refused;

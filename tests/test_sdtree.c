@@ -196,6 +196,7 @@ static void test_documented_defaults_are_the_defaults(void **state)
                   {"rho", (double)d.rho},
                   {"smoothing", (double)d.smoothing},
                   {"gaussian_sigma", (double)d.gaussian_sigma},
+                  {"denoise_budget", (double)d.denoise_budget},
                   {"max_depth", d.max_depth},
                   {"max_levels", d.max_levels},
                   {"min_samples", d.min_samples},

@@ -420,7 +420,8 @@ static bool learn(render_state *r, const tr_pass *pass)
     if (m->end_pass)
         ok = m->end_pass(r->frame.method_data, pass);
     r->update_cpu += tr_cpu_seconds() - start;
-    r->result->train_seconds = cpu_used(r);
+    if (m->learns)
+        r->result->train_seconds = cpu_used(r);
     return ok;
 }
 
