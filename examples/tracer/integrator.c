@@ -72,7 +72,8 @@ struct tr_worker {
     int index[TR_PATHS];
     vec3 wi[TR_PATHS];
     float pdf_guide[TR_PATHS], sample_u[TR_PATHS][2];
-    /* NEE */
+    /* NEE, by the same k; `lit` lists those that a light may reach. */
+    int lit[TR_PATHS], lit_count;
     tr_light_sample lights[TR_PATHS];
     vec3 light_f[TR_PATHS];
     float light_pdf_bsdf[TR_PATHS];
@@ -444,6 +445,7 @@ static void query_pdf(tr_worker *w, const tr_frame *frame, int n)
 
 static void sample_lights(tr_worker *w, const tr_frame *frame)
 {
+    w->lit_count = 0;
     for (int k = 0; k < w->smooth_count; ++k) {
         int id = w->smooth[k];
         path *p = &w->paths[id];
@@ -451,13 +453,11 @@ static void sample_lights(tr_worker *w, const tr_frame *frame)
         float u0 = rng_float(&p->rng), u1, u2;
         rng_float2(&p->rng, &u1, &u2);
         w->pdf_guide[k] = 0;
-        if (!tr_light_sample_direction(frame->scene, w->surfaces[id].p, u0, u1, u2, l) || !(l->pdf > 0)) {
-            l->pdf = 0;
+        if (!tr_light_sample_direction(frame->scene, w->surfaces[id].p, u0, u1, u2, l))
             continue;
-        }
         w->light_f[k] = tr_closure_eval(&w->closures[id], l->wi, &w->light_pdf_bsdf[k]);
-        if (black3(w->light_f[k]))
-            l->pdf = 0;
+        w->lit[w->lit_count] = k; /* kept by counting it: a branch would be guessed wrong */
+        w->lit_count += !black3(w->light_f[k]);
     }
 }
 
@@ -470,13 +470,12 @@ static float mixture(const tr_closure *c, float alpha, float pdf_bsdf, float pdf
 
 static void next_event(tr_worker *w, const tr_frame *frame, bool recording)
 {
-    int guided = 0;
+    int visible = 0, guided = 0;
     sample_lights(w, frame);
     double start = tr_wall_seconds();
-    for (int k = 0; k < w->smooth_count; ++k) {
-        tr_light_sample *l = &w->lights[k];
-        if (!(l->pdf > 0))
-            continue;
+    for (int i = 0; i < w->lit_count; ++i) {
+        int k = w->lit[i];
+        const tr_light_sample *l = &w->lights[k];
         const tr_surface *s = &w->surfaces[w->smooth[k]];
         struct RTCRay ray;
         vec3 origin = leave_surface(frame->scene, s, l->wi);
@@ -484,22 +483,23 @@ static void next_event(tr_worker *w, const tr_frame *frame, bool recording)
             set_ray(&ray, origin, l->wi, INFINITY);
         else /* to the sampled point: along wi from the shifted origin a curved light would shade itself */
             set_ray(&ray, origin, sub3(madd3(s->p, l->wi, l->distance), origin), 1 - 1e-4f);
-        if (tr_rtc_occluded(frame->scene->rtc, &ray))
-            l->pdf = 0;
-        w->counters.shadow_rays++;
+        w->lit[visible] = k;
+        visible += !tr_rtc_occluded(frame->scene->rtc, &ray);
     }
     w->counters.trace += tr_wall_seconds() - start;
-    for (int k = 0; k < w->smooth_count; ++k) /* what is in the shadow needs no weight */
-        if (w->lights[k].pdf > 0 && w->alpha[k] < 1 && !w->lights[k].delta) {
+    w->counters.shadow_rays += (uint64_t)w->lit_count;
+    w->lit_count = visible; /* what is in the shadow needs no weight */
+    for (int i = 0; frame->guiding && i < visible; ++i) {
+        int k = w->lit[i];
+        if (w->alpha[k] < 1 && !w->lights[k].delta) {
             w->wi[k] = w->lights[k].wi;
             w->index[guided++] = k;
         }
+    }
     query_pdf(w, frame, guided);
-    for (int k = 0; k < w->smooth_count; ++k) {
+    for (int i = 0; i < visible; ++i) {
+        int k = w->lit[i], id = w->smooth[k];
         const tr_light_sample *l = &w->lights[k];
-        if (!(l->pdf > 0))
-            continue;
-        int id = w->smooth[k];
         path *p = &w->paths[id];
         const tr_closure *c = &w->closures[id];
         float weight = 1;

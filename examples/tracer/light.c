@@ -322,15 +322,11 @@ typedef struct area_point {
     float pdf;
 } area_point;
 
-/* A point on a mesh, unless the triangle drawn turns its back to `to`: the whole triangle then does, and since that is
-   the most common answer it is found out first. */
-static bool mesh_point(const tr_shape *shape, vec3 to, float u_extra, float u1, float u2, area_point *out)
+/* A point on triangle i of a mesh; u1 is what chose it. u_extra, what choosing the light left over, refills the low
+   bits of u1 that choosing the triangle used up. */
+static void triangle_point(const tr_shape *shape, uint32_t i, float u_extra, float u1, float u2, area_point *out)
 {
-    uint32_t i = cdf_find(shape->area_cdf, shape->triangle_count, u1);
     const tr_emitter *e = &shape->emitters[i];
-    if (!(dot3(e->n, sub3(to, e->p)) > 0))
-        return false;
-    /* u_extra, what choosing the light left over, refills the low bits of u1 that choosing the triangle used up. */
     float width = shape->area_cdf[i + 1] - shape->area_cdf[i];
     float a = width > 0 ? (u1 - shape->area_cdf[i] + u_extra * 0x1p-24f) / width : 0;
     a = clampf(a, 0, 1);
@@ -338,7 +334,6 @@ static bool mesh_point(const tr_shape *shape, vec3 to, float u_extra, float u1, 
     out->p = madd3(madd3(e->p, e->e1, b1), e->e2, b2);
     out->ng = e->n;
     out->pdf = 1.0f / shape->area;
-    return true;
 }
 
 /* Area of the world per unit of (phi, z) around a local point of the cylinder; not constant where the transform scales
@@ -414,18 +409,24 @@ static TR_NOINLINE bool sphere_sample(const tr_shape *shape, vec3 p, float u1, f
     return sample->distance > 0;
 }
 
-static bool area_sample(const tr_scene *scene, const tr_light *light, vec3 p, float u_extra, float u1, float u2,
+static bool area_sample(const tr_scene *scene, const tr_light *light, vec3 p, float u_select, float u1, float u2,
                         tr_light_sample *sample)
 {
     const tr_shape *shape = &scene->shapes[light->shape];
-    sample->radiance = light->value;
-    if (shape->type == TR_SHAPE_SPHERE && !shape->flip_normals)
+    area_point point;
+    if (shape->type == TR_SHAPE_MESH) {
+        /* A triangle that turns its back to p is the most common answer: it is found out before all else. */
+        uint32_t i = cdf_find(shape->area_cdf, shape->triangle_count, u1);
+        if (!(dot3(shape->emitters[i].n, sub3(p, shape->emitters[i].p)) > 0))
+            return false;
+        triangle_point(shape, i, cdf_rest(scene->light_cdf, (uint32_t)sample->light, u_select), u1, u2, &point);
+    } else if (shape->type == TR_SHAPE_SPHERE && !shape->flip_normals) {
+        sample->radiance = light->value;
         return sphere_sample(shape, p, u1, u2, sample);
-    area_point point = {0};
-    if (shape->type != TR_SHAPE_MESH)
+    } else {
         analytic_point(shape, u1, u2, &point);
-    else if (!mesh_point(shape, p, u_extra, u1, u2, &point))
-        return false;
+    }
+    sample->radiance = light->value;
     vec3 d = sub3(point.p, p);
     float d2 = dot3(d, d), facing = -dot3(point.ng, d);
     if (!(facing > 0 && d2 > 0))
@@ -503,7 +504,7 @@ bool tr_light_sample_direction(const tr_scene *scene, vec3 p, float u_select, fl
     bool ok = true;
     switch (light->type) {
     case TR_LIGHT_AREA:
-        ok = area_sample(scene, light, p, cdf_rest(scene->light_cdf, i, u_select), u1, u2, sample);
+        ok = area_sample(scene, light, p, u_select, u1, u2, sample);
         break;
     case TR_LIGHT_POINT:
     case TR_LIGHT_SPOT:

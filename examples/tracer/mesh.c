@@ -39,9 +39,27 @@ void tr_mesh_free(tr_shape *s)
     free(s->normals);
     free(s->uvs);
     free(s->indices);
-    s->positions = s->normals = s->uvs = NULL;
+    free(s->packed);
+    s->positions = s->normals = s->uvs = s->packed = NULL;
     s->indices = NULL;
     s->vertex_count = s->triangle_count = 0;
+}
+
+bool tr_mesh_pack(tr_shape *s)
+{
+    free(s->packed);
+    s->packed = tr_alloc_pages(((size_t)s->vertex_count + 1) * TR_PACKED * sizeof *s->packed);
+    if (!s->packed)
+        return false;
+    for (size_t i = 0; i < s->vertex_count; ++i) {
+        float *to = s->packed + TR_PACKED * i;
+        memcpy(to, s->positions + 3 * i, 3 * sizeof *to);
+        if (s->uvs)
+            memcpy(to + 3, s->uvs + 2 * i, 2 * sizeof *to);
+        if (s->normals)
+            memcpy(to + 5, s->normals + 3 * i, 3 * sizeof *to);
+    }
+    return true;
 }
 
 bool tr_mesh_indices_valid(const tr_shape *s)

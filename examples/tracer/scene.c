@@ -390,7 +390,7 @@ static bool measure_shapes(tr_scene *scene, tr_log *log)
     for (int i = 0; i < scene->shape_count; ++i) {
         tr_shape *s = &scene->shapes[i];
         scene->triangles += s->triangle_count;
-        if (!tr_shape_measure(s, s->light >= 0))
+        if (!tr_shape_measure(s, s->light >= 0) || (s->type == TR_SHAPE_MESH && !tr_mesh_pack(s)))
             return false;
         if (s->light >= 0 && !(s->area > 0 && isfinite(s->area))) {
             tr_message(log, TR_WARNING, scene->path, s->line,

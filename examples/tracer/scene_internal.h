@@ -88,6 +88,7 @@ void tr_mesh_transform(tr_shape *shape, const mat4 *to_world);
 bool tr_mesh_smooth_normals(tr_shape *shape);
 /* Turn each triangle so that its winding agrees with its vertex normals. */
 void tr_mesh_align_winding(tr_shape *shape);
+bool tr_mesh_pack(tr_shape *shape); /* fill `packed`; false = out of memory */
 bool tr_mesh_indices_valid(const tr_shape *shape);
 #define TR_MESH_MAX (UINT64_C(1) << 29)
 

@@ -516,21 +516,21 @@ static void mesh_tangents(const tr_shape *s, tr_surface *out)
 static inline void mesh_surface(const tr_shape *s, uint32_t t, float b1, float b2, tr_surface *out)
 {
     const uint32_t *id = s->indices + 3 * (size_t)t;
-    vec3 p0 = vertex(s, t, 0), e1 = sub3(vertex(s, t, 1), p0), e2 = sub3(vertex(s, t, 2), p0);
-    out->p = madd3(madd3(p0, e1, b1), e2, b2);
-    out->ng = out->ns = norm3(cross3(e1, e2));
-    out->u = b1;
-    out->v = b2;
-    if (s->uvs) {
-        const float *a = s->uvs + 2 * (size_t)id[0], *b = s->uvs + 2 * (size_t)id[1], *c = s->uvs + 2 * (size_t)id[2];
-        out->u = a[0] + b1 * (b[0] - a[0]) + b2 * (c[0] - a[0]);
-        out->v = a[1] + b1 * (b[1] - a[1]) + b2 * (c[1] - a[1]);
+    const float *a = s->packed + TR_PACKED * (size_t)id[0], *b = s->packed + TR_PACKED * (size_t)id[1],
+                *c = s->packed + TR_PACKED * (size_t)id[2];
+    float e1[TR_PACKED], e2[TR_PACKED], at[TR_PACKED];
+    for (int i = 0; i < TR_PACKED; ++i) {
+        e1[i] = b[i] - a[i];
+        e2[i] = c[i] - a[i];
+        at[i] = a[i] + e1[i] * b1 + e2[i] * b2;
     }
+    out->p = get3(at);
+    out->ng = out->ns = norm3(cross3(get3(e1), get3(e2)));
+    out->u = s->uvs ? at[3] : b1;
+    out->v = s->uvs ? at[4] : b2;
     if (!s->normals)
         return;
-    const float *n = s->normals;
-    vec3 ns = scale3(get3(n + 3 * (size_t)id[0]), 1 - b1 - b2);
-    ns = madd3(madd3(ns, get3(n + 3 * (size_t)id[1]), b1), get3(n + 3 * (size_t)id[2]), b2);
+    vec3 ns = get3(at + 5);
     float l2 = dot3(ns, ns);
     if (!(l2 > 1e-20f) || !isfinite(l2))
         return;
@@ -600,20 +600,13 @@ void tr_surface_prefetch(const tr_scene *scene, const struct RTCRayHit *hit, int
     const tr_shape *s = &scene->shapes[hit->hit.geomID];
     if (s->type != TR_SHAPE_MESH)
         return;
-    if (s->triangle_count < 64) /* walls and the like stay in the cache */
-        return;
     const uint32_t *id = s->indices + 3 * (size_t)hit->hit.primID;
     if (stage == 0) {
         TR_PREFETCH(id);
         return;
     }
-    for (int i = 0; i < 3; ++i) {
-        TR_PREFETCH(s->positions + 3 * (size_t)id[i]);
-        if (s->uvs)
-            TR_PREFETCH(s->uvs + 2 * (size_t)id[i]);
-        if (s->normals)
-            TR_PREFETCH(s->normals + 3 * (size_t)id[i]);
-    }
+    for (int i = 0; i < 3; ++i)
+        TR_PREFETCH(s->packed + TR_PACKED * (size_t)id[i]);
 }
 
 static inline void surface_from_hit(const tr_shape *s, const struct RTCRayHit *hit, bool tangents, tr_surface *surface)

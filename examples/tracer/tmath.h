@@ -147,9 +147,9 @@ static inline void sincos_turn(float u, float *sine, float *cosine)
     float s = x + x * x2 * (-1.6666654611e-1f + x2 * (8.3321608736e-3f - x2 * 1.9515295891e-4f));
     float c =
         1 - 0.5f * x2 + x2 * x2 * (4.166664568298827e-2f + x2 * (-1.388731625493765e-3f + x2 * 2.443315711809948e-5f));
-    float a = quarter & 1 ? c : s, b = quarter & 1 ? s : c;
-    *sine = quarter & 2 ? -a : a;
-    *cosine = (quarter + 1) & 2 ? -b : b;
+    const float both[3] = {s, c, s}; /* indexed and multiplied, since branches on a random quarter are guessed wrong */
+    *sine = both[quarter & 1] * (float)(1 - (quarter & 2));
+    *cosine = both[(quarter & 1) + 1] * (float)(1 - ((quarter + 1) & 2));
 }
 
 /* Warps of (u1, u2) in [0,1)^2. */

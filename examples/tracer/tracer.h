@@ -192,6 +192,7 @@ typedef struct tr_emitter {
     vec3 p, e1, e2, n; /* corner, edges from it, unit front normal (flip_normals applied) */
 } tr_emitter;
 
+#define TR_PACKED 8 /* floats: x, y, z, u, v, and the normal's x, y, z */
 typedef struct tr_shape {
     tr_shape_type type;
     char *id;
@@ -204,6 +205,9 @@ typedef struct tr_shape {
     float *normals;    /* [vertex_count][3] or NULL = face normals */
     float *uvs;        /* [vertex_count][2] or NULL */
     uint32_t *indices; /* [triangle_count][3] */
+    /* [vertex_count][TR_PACKED], filled by tr_scene_finish: positions, uvs and normals (0 where there are none) once
+       more, so that a hit reads half a cache line for each corner of its triangle instead of three lines. */
+    float *packed;
     /* Analytic, world space. The sphere has centre and radius (uniform scale); disk and cylinder keep the transforms.
      */
     mat4 object_to_world, world_to_object;
