@@ -118,11 +118,12 @@
      Building part: 20 bytes per quadtree node, sizeof(gsd_cell_state) (below 600) per cell.
      max_bytes bounds the peak of both parts while refine runs, old and new together: trees coarsen and cells stop
      splitting; it never fails. (Only what comes from outside can lie above it, and stays: the cells of a forest,
-     imported trees.) Of it GSD_DENOISE_GAUSSIAN takes up to a quarter, 10 MB for a tree of depth 10, four times that
-   for each level more and for up to 32 trees at once, and up to an eighth for the trees it makes, 28 bytes per node,
-   which stay until the new part stands. Streams (44 bytes per sample) and the scratch of accumulate (at most 13 MB and
-   8 bytes per cell, kept for the next call) come on top. Allocation happens in create, stream_create, record,
-   accumulate, refine, import, load, gsd_forest_split; never in a query. Stack: below 16 KB per call.
+     imported trees.) Denoising takes of it 24 bytes per node of the old building part, which are gone before the new
+     part is made; GSD_DENOISE_GAUSSIAN up to a quarter instead, 10 MB for a tree of depth 10, four times that for each
+     level more and for up to 32 trees at once, and up to an eighth for the trees it makes, 28 bytes per node, which
+     stay until the new part stands. Streams (44 bytes per sample) and the scratch of accumulate (at most 13 MB and 8
+     bytes per cell, kept for the next call) come on top. Allocation happens in create, stream_create, record,
+     accumulate, refine, import, load, gsd_forest_split; never in a query. Stack: below 16 KB per call.
 
    THREADS: each function has a tag.
      [any thread]   pure function on constant data
@@ -4862,9 +4863,8 @@ static void gsdi_draw_alias(const gsd_view *view, gsdi_draw *d)
 }
 
 #if GSDI_X86
-/* Draws as arrays, in groups of eight. The steps are those of gsd_sample, in the same operations, so results are equal
- * bit by bit.
- */
+/* Draws as arrays, in groups of eight. The steps are those of gsd_sample, in the same operations, so results
+   are equal bit by bit. */
 typedef struct gsdi_draws {
     double r[2][GSDI_LANES], lo[2][GSDI_LANES], width[2][GSDI_LANES];
     uint32_t bits[2][GSDI_LANES]; /* of u, 24 each; then [1]: the bin of a product */

@@ -4,9 +4,9 @@
    (samples of a cell before it splits), rho, smoothing, max_depth, max_levels, min_samples, max_memory_mb,
    spatial_filter=nearest|stochastic, directional_filter=nearest|box, learn_alpha=grid|adam|off (on = grid), alpha,
    gate=on|off, gate_margin, gate_gain, gate_probe, guide_weight=on|off, history=on|off, denoise=on|off|gaussian,
-   denoise_budget,
-   denoise_when=training|last (in every refine, or only in that which ends --train); of denoise=gaussian: sigma,
-   gaussian_rho, gaussian_sphere=off|on, gaussian_limit=on|off; uniform, alias=on|off, simd=scalar|avx2|avx512|neon,
+   denoise_budget, denoise_when=training|last (in every refine, or only in that which ends --train); of
+   denoise=gaussian: sigma, gaussian_rho, gaussian_sphere=off|on, gaussian_limit=on|off; uniform, alias=on|off,
+   simd=scalar|avx2|avx512|neon,
    product=on|off (with the cosine), jitter=on|off (find looks up a jittered position), sparse=on|off (closed fields
    record only some tiles). */
 #include <stdlib.h>
