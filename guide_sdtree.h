@@ -1004,7 +1004,7 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_LIT                                                                                                       \
     24.0                      /* ... times its share of non-zero samples: parts of a dark cell would know too little;  \
                                  tuned on lamps, ajar (8 .. 32) */
-#define GSDI_BLUR_EVEN 0.05   /* share of evenness in the density that one half of the samples says of the other */
+#define GSDI_BLUR_EVEN 0.005  /* share of evenness in the density that one half of the samples says of the other */
 #define GSDI_BLUR_MOST 0.6    /* of the way towards the surroundings, for one half */
 #define GSDI_BLUR_STEPS 5     /* halvings of the interval that holds the best blur */
 #define GSDI_BLUR_FREE 131072 /* leaves that are blurred whatever the budget */
