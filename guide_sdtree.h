@@ -1446,6 +1446,18 @@ static double gsdi_tree_masses(const uint32_t *child, gsdi_sum *sum, uint32_t co
     return mass[0];
 }
 
+/* Child k of a visited node of a tree: another node, or a quarter of a leaf; `out` is its number in another tree. */
+static void gsdi_visit_child(const gsdi_visit *v, const uint32_t *child, const gsdi_sum *sum, uint32_t k, uint32_t out,
+                             gsdi_visit *next)
+{
+    uint32_t c = v->node == GSDI_NONE ? 0 : child[v->node];
+    next->node = c ? c + k : GSDI_NONE;
+    next->depth = v->depth + 1;
+    next->out = out;
+    next->sum.half[0] = c ? sum[next->node].half[0] : v->sum.half[0] * 0.25;
+    next->sum.half[1] = c ? sum[next->node].half[1] : v->sum.half[1] * 0.25;
+}
+
 /* Structure for the next pass: a node is divided where its mass exceeds limit; new halves get a quarter each. out_child
    and out_sum (keep times the old sums, pushed down evenly) may be NULL: count only. Returns the number of nodes. */
 static uint32_t gsdi_refine_tree(const uint32_t *child, const gsdi_sum *sum, const double *mass, double limit,
@@ -1469,13 +1481,8 @@ static uint32_t gsdi_refine_tree(const uint32_t *child, const gsdi_sum *sum, con
             continue;
         for (k = 3; k >= 0; --k) {
             gsdi_visit *next = &stack[++top];
-            uint32_t c = v.node == GSDI_NONE ? 0 : child[v.node];
-            next->node = c ? c + (uint32_t)k : GSDI_NONE;
-            next->depth = v.depth + 1;
-            next->out = total + (uint32_t)k;
-            next->mass = c ? mass[next->node] : v.mass * 0.25;
-            next->sum.half[0] = c ? sum[next->node].half[0] : v.sum.half[0] * 0.25;
-            next->sum.half[1] = c ? sum[next->node].half[1] : v.sum.half[1] * 0.25;
+            gsdi_visit_child(&v, child, sum, (uint32_t)k, total + (uint32_t)k, next);
+            next->mass = next->node != GSDI_NONE ? mass[next->node] : v.mass * 0.25;
         }
         total += 4;
     }
@@ -1584,14 +1591,21 @@ static void gsdi_blur_mean(const gsdi_blur *b, const gsdi_around *at, const floa
     }
 }
 
+/* first * 4^-k: shares of a square that lies k levels above, or of the whole at depth k. */
+static void gsdi_quarters(double first, float part[25])
+{
+    uint32_t k;
+    for (k = 0; k < 25; ++k)
+        part[k] = (float)(first / (double)((uint64_t)1 << (2 * k)));
+}
+
 /* Means around the leaves of a divided tree, and their sums. */
 static void gsdi_blur_near(const uint32_t *child, gsdi_blur *b, double total[3])
 {
     gsdi_around stack[GSDI_STACK], at;
     float part[25];
     uint32_t top = 0, k;
-    for (k = 0; k < 25; ++k)
-        part[k] = 1.0f / (float)((uint64_t)1 << (2 * k));
+    gsdi_quarters(1, part);
     total[0] = total[1] = total[2] = 0;
     memset(&stack[0], 0, sizeof stack[0]);
     for (++top; top;) {
@@ -1613,8 +1627,7 @@ static void gsdi_blur_moves(const uint32_t *child, const unsigned char *depth, u
 {
     float part[25];
     uint32_t i, k;
-    for (k = 0; k < 25; ++k)
-        part[k] = (float)(GSDI_BLUR_EVEN / (1 - GSDI_BLUR_EVEN) / (double)((uint64_t)1 << (2 * k)));
+    gsdi_quarters(GSDI_BLUR_EVEN / (1 - GSDI_BLUR_EVEN), part);
     for (i = 0; i < count; ++i) {
         b->even[i] = part[depth[i]];
         for (k = 0; k < 2; ++k) {
@@ -1827,13 +1840,12 @@ static inline void gsdi_gauss_map(const uint32_t *child, uint32_t layer, uint64_
     }
 }
 
-/* Runs of the block rows `from` .. `to` - 1; at most (to - from) * width / 8. Returns their number. */
-static inline size_t gsdi_gauss_runs(const uint64_t *map, uint32_t width, uint32_t from, uint32_t to,
-                                     gsdi_gauss_run *run)
+/* Runs of a map, at most width / 8 in each block row. Returns their number. */
+static inline size_t gsdi_gauss_runs(const uint64_t *map, uint32_t width, gsdi_gauss_run *run)
 {
     uint32_t blocks = width / GSDI_GAUSS_COLUMNS, stride = gsdi_gauss_map_stride(width), r, b;
     size_t count = 0;
-    for (r = from; r < to; ++r) {
+    for (r = 0; r < width / GSDI_GAUSS_ROWS; ++r) {
         const uint64_t *row = map + (size_t)r * stride;
         for (b = 0; b < blocks;) {
             uint64_t rest = row[b / 64] >> (b % 64);
@@ -1880,13 +1892,12 @@ static inline void gsdi_gauss_strip(const float *in, size_t stride, float *out, 
     }
 }
 
-/* Rows `from` .. `to` - 1, multiples of 4. */
-static inline void gsdi_gauss_full_scalar(const float *in, size_t stride, float *out, size_t out_stride, uint32_t width,
-                                          uint32_t from, uint32_t to, const float w[4])
+/* The whole matrix; out without margins. */
+static inline void gsdi_gauss_full_scalar(const float *in, size_t stride, float *out, uint32_t width, const float w[4])
 {
-    uint32_t r;
-    for (r = from; r < to; r += GSDI_GAUSS_ROWS)
-        gsdi_gauss_strip(in + r * stride, stride, out + r * out_stride, out_stride, width, w);
+    size_t r;
+    for (r = 0; r < width; r += GSDI_GAUSS_ROWS)
+        gsdi_gauss_strip(in + r * stride, stride, out + r * width, width, width, w);
 }
 
 /* Only the blocks of these runs, packed: 4 rows of 4, block after block in the order of the runs; out 64-byte aligned,
@@ -1959,23 +1970,23 @@ GSDI_GAUSS_AVX2_INLINE __m256 gsdi_gauss_row_avx2(const __m256 *w, __m256 v, __m
 }
 
 /* Rows are written out one by one: a loop over them would put v into memory where the compiler does not unroll. */
-GSDI_GAUSS_AVX2 static inline void gsdi_gauss_full_avx2(const float *in, size_t stride, float *out, size_t out_stride,
-                                                        uint32_t width, uint32_t from, uint32_t to, const float w[4])
+GSDI_GAUSS_AVX2 static inline void gsdi_gauss_full_avx2(const float *in, size_t stride, float *out, uint32_t width,
+                                                        const float w[4])
 {
     __m256 weight[4], v[4], next[4];
     uint32_t r, c;
     for (r = 0; r < 4; ++r)
         weight[r] = _mm256_set1_ps(w[r]);
-    for (r = from; r < to; r += GSDI_GAUSS_ROWS) {
+    for (r = 0; r < width; r += GSDI_GAUSS_ROWS) {
         const float *p = in + r * stride;
-        float *o = out + r * out_stride;
+        float *o = out + (size_t)r * width;
         gsdi_gauss_columns_avx2(p - 4, stride, weight, v);
         for (c = 0; c < width; c += 8) {
             gsdi_gauss_columns_avx2(p + c + 4, stride, weight, next);
             _mm256_stream_ps(o + c, gsdi_gauss_row_avx2(weight, v[0], next[0]));
-            _mm256_stream_ps(o + out_stride + c, gsdi_gauss_row_avx2(weight, v[1], next[1]));
-            _mm256_stream_ps(o + 2 * out_stride + c, gsdi_gauss_row_avx2(weight, v[2], next[2]));
-            _mm256_stream_ps(o + 3 * out_stride + c, gsdi_gauss_row_avx2(weight, v[3], next[3]));
+            _mm256_stream_ps(o + width + c, gsdi_gauss_row_avx2(weight, v[1], next[1]));
+            _mm256_stream_ps(o + 2 * (size_t)width + c, gsdi_gauss_row_avx2(weight, v[2], next[2]));
+            _mm256_stream_ps(o + 3 * (size_t)width + c, gsdi_gauss_row_avx2(weight, v[3], next[3]));
             v[0] = next[0];
             v[1] = next[1];
             v[2] = next[2];
@@ -2058,26 +2069,25 @@ GSDI_GAUSS_AVX512_INLINE void gsdi_gauss_row_avx512(const __m512 *w, __m512 low,
 }
 
 /* Whole rows: three aligned vectors of vertical sums at a time. */
-GSDI_GAUSS_AVX512 static inline void gsdi_gauss_full_avx512(const float *in, size_t stride, float *out,
-                                                            size_t out_stride, uint32_t width, uint32_t from,
-                                                            uint32_t to, const float w[4])
+GSDI_GAUSS_AVX512 static inline void gsdi_gauss_full_avx512(const float *in, size_t stride, float *out, uint32_t width,
+                                                            const float w[4])
 {
     __m512 weight[4];
     uint32_t r, c;
     for (r = 0; r < 4; ++r)
         weight[r] = _mm512_set1_ps(w[r]);
-    for (r = from; r < to; r += GSDI_GAUSS_ROWS) {
+    for (r = 0; r < width; r += GSDI_GAUSS_ROWS) {
         const float *p = in + r * stride;
-        float *o = out + r * out_stride;
+        float *o = out + (size_t)r * width;
         __m512 low[4], v[4], high[4];
         gsdi_gauss_columns_avx512(p - 16, stride, weight, low);
         gsdi_gauss_columns_avx512(p, stride, weight, v);
         for (c = 0; c < width; c += 16) {
             gsdi_gauss_columns_avx512(p + c + 16, stride, weight, high);
             gsdi_gauss_row_avx512(weight, low[0], v[0], high[0], o + c);
-            gsdi_gauss_row_avx512(weight, low[1], v[1], high[1], o + out_stride + c);
-            gsdi_gauss_row_avx512(weight, low[2], v[2], high[2], o + 2 * out_stride + c);
-            gsdi_gauss_row_avx512(weight, low[3], v[3], high[3], o + 3 * out_stride + c);
+            gsdi_gauss_row_avx512(weight, low[1], v[1], high[1], o + width + c);
+            gsdi_gauss_row_avx512(weight, low[2], v[2], high[2], o + 2 * (size_t)width + c);
+            gsdi_gauss_row_avx512(weight, low[3], v[3], high[3], o + 3 * (size_t)width + c);
             low[0] = v[0];
             low[1] = v[1];
             low[2] = v[2];
@@ -2204,15 +2214,14 @@ static inline void gsdi_gauss_strip_neon(const float *p, size_t stride, float *o
     }
 }
 
-static inline void gsdi_gauss_full_neon(const float *in, size_t stride, float *out, size_t out_stride, uint32_t width,
-                                        uint32_t from, uint32_t to, const float w[4])
+static inline void gsdi_gauss_full_neon(const float *in, size_t stride, float *out, uint32_t width, const float w[4])
 {
     float32x4_t weight[4];
-    uint32_t r;
+    size_t r;
     for (r = 0; r < 4; ++r)
         weight[r] = vdupq_n_f32(w[r]);
-    for (r = from; r < to; r += GSDI_GAUSS_ROWS)
-        gsdi_gauss_strip_neon(in + r * stride, stride, out + r * out_stride, out_stride, GSDI_GAUSS_COLUMNS,
+    for (r = 0; r < width; r += GSDI_GAUSS_ROWS)
+        gsdi_gauss_strip_neon(in + r * stride, stride, out + r * width, width, GSDI_GAUSS_COLUMNS,
                               width / GSDI_GAUSS_COLUMNS, weight);
 }
 
@@ -2240,16 +2249,16 @@ static void gsdi_gauss_full(gsd_simd simd, const float *in, float *out, uint32_t
     size_t stride = gsdi_gauss_stride(width);
 #if GSDI_X86
     if (simd == GSD_SIMD_AVX512)
-        gsdi_gauss_full_avx512(in, stride, out, width, width, 0, width, w);
+        gsdi_gauss_full_avx512(in, stride, out, width, w);
     else if (simd == GSD_SIMD_AVX2)
-        gsdi_gauss_full_avx2(in, stride, out, width, width, 0, width, w);
+        gsdi_gauss_full_avx2(in, stride, out, width, w);
     else
 #elif GSDI_NEON
     if (simd == GSD_SIMD_NEON)
-        gsdi_gauss_full_neon(in, stride, out, width, width, 0, width, w);
+        gsdi_gauss_full_neon(in, stride, out, width, w);
     else
 #endif
-        gsdi_gauss_full_scalar(in, stride, out, width, width, 0, width, w);
+        gsdi_gauss_full_scalar(in, stride, out, width, w);
     (void)simd;
 }
 
@@ -2409,7 +2418,7 @@ static void gsdi_gauss_layer(gsdi_gauss_slot *slot, const uint32_t *child, const
     gsdi_gauss_flatten(child, mass, height, layer, m, stride);
     gsdi_gauss_pad(m, stride, width, sphere);
     gsdi_gauss_map(child, layer, slot->map);
-    runs = gsdi_gauss_runs(slot->map, width, 0, width / GSDI_GAUSS_ROWS, slot->run);
+    runs = gsdi_gauss_runs(slot->map, width, slot->run);
     for (i = 0; i < runs; ++i)
         blocks += (size_t)(slot->run[i].end - slot->run[i].first);
     whole = blocks * GSDI_GAUSS_BLOCK * 4 > (size_t)width * width * 3;
@@ -2477,14 +2486,9 @@ static uint32_t gsdi_gauss_rebuild(const gsdi_gauss_slot *slot, double rho, cons
         }
         for (k = 4; divide && k-- > 0;) {
             gsdi_visit *next = &stack[++top];
-            uint32_t c = v.node == GSDI_NONE ? 0 : old[v.node];
-            next->node = c ? c + k : GSDI_NONE;
-            next->depth = v.depth + 1;
+            gsdi_visit_child(&v, old, old_sum, k, total + k, next);
             next->x = 2 * v.x + (k & 1);
             next->y = 2 * v.y + (k >> 1);
-            next->out = total + k;
-            next->sum.half[0] = c ? old_sum[next->node].half[0] : v.sum.half[0] * 0.25;
-            next->sum.half[1] = c ? old_sum[next->node].half[1] : v.sum.half[1] * 0.25;
         }
         total += divide ? 4 : 0;
     }

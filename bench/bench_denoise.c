@@ -268,25 +268,16 @@ static void run_pad(data *d) { gsdi_gauss_pad(d->own, gsdi_gauss_stride(WIDTH), 
 static void run_runs(data *d)
 {
     gsdi_gauss_map(d->building, DEPTH, d->map);
-    d->runs = gsdi_gauss_runs(d->map, WIDTH, 0, WIDTH / GSDI_GAUSS_ROWS, d->run);
+    d->runs = gsdi_gauss_runs(d->map, WIDTH, d->run);
 }
-static void run_full(data *d)
-{
-    gsdi_gauss_full_scalar(d->own, gsdi_gauss_stride(WIDTH), d->out, WIDTH, WIDTH, 0, WIDTH, d->w);
-}
+static void run_full(data *d) { gsdi_gauss_full_scalar(d->own, gsdi_gauss_stride(WIDTH), d->out, WIDTH, d->w); }
 static void run_packed(data *d)
 {
     gsdi_gauss_packed_scalar(d->own, gsdi_gauss_stride(WIDTH), d->out, d->run, d->runs, d->w);
 }
 #if GSDI_X86
-static void run_full_avx2(data *d)
-{
-    gsdi_gauss_full_avx2(d->own, gsdi_gauss_stride(WIDTH), d->out, WIDTH, WIDTH, 0, WIDTH, d->w);
-}
-static void run_full_avx512(data *d)
-{
-    gsdi_gauss_full_avx512(d->own, gsdi_gauss_stride(WIDTH), d->out, WIDTH, WIDTH, 0, WIDTH, d->w);
-}
+static void run_full_avx2(data *d) { gsdi_gauss_full_avx2(d->own, gsdi_gauss_stride(WIDTH), d->out, WIDTH, d->w); }
+static void run_full_avx512(data *d) { gsdi_gauss_full_avx512(d->own, gsdi_gauss_stride(WIDTH), d->out, WIDTH, d->w); }
 static void run_packed_avx2(data *d)
 {
     gsdi_gauss_packed_avx2(d->own, gsdi_gauss_stride(WIDTH), d->out, d->run, d->runs, d->w);
@@ -298,10 +289,7 @@ static void run_packed_avx512(data *d)
 #endif
 
 #if GSDI_NEON
-static void run_full_neon(data *d)
-{
-    gsdi_gauss_full_neon(d->own, gsdi_gauss_stride(WIDTH), d->out, WIDTH, WIDTH, 0, WIDTH, d->w);
-}
+static void run_full_neon(data *d) { gsdi_gauss_full_neon(d->own, gsdi_gauss_stride(WIDTH), d->out, WIDTH, d->w); }
 static void run_packed_neon(data *d)
 {
     gsdi_gauss_packed_neon(d->own, gsdi_gauss_stride(WIDTH), d->out, d->run, d->runs, d->w);

@@ -406,6 +406,16 @@ static void write_tables(FILE *f, const plan *p, const rows *all)
 
 /* ---- plots */
 
+/* Columns that a plot has room for, and their labels. Returns their number. */
+static int plotted(const plan *p, column *columns, char labels[MAX_NAMES][200])
+{
+    int n = columns_of(p, columns);
+    n = n < MAX_NAMES ? n : MAX_NAMES;
+    for (int c = 0; c < n; ++c)
+        label(labels[c], 200, p, columns[c]);
+    return n;
+}
+
 static void plot_scene(const plan *p, const rows *all, const char *scene, bool by_spp)
 {
     const char *kind = !by_spp ? "seconds" : p->trained ? "train" : "spp";
@@ -416,11 +426,8 @@ static void plot_scene(const plan *p, const rows *all, const char *scene, bool b
     static char labels[MAX_NAMES][200];
     plot_series series[MAX_NAMES];
     char path[1024], title[160];
-    int n = columns_of(p, columns);
-    if (n > MAX_NAMES)
-        n = MAX_NAMES;
+    int n = plotted(p, columns, labels);
     for (int c = 0; c < n; ++c) {
-        label(labels[c], sizeof labels[c], p, columns[c]);
         for (int b = 0; b < p->budgets.count; ++b) {
             x[c][b] = mean_of(p, all, scene, columns[c], p->budgets.at[b], of).value;
             y[c][b] = mean_of(p, all, scene, columns[c], p->budgets.at[b], value_relmse).value;
@@ -440,13 +447,10 @@ static void plot_overall(const plan *p, const rows *all)
     static char labels[MAX_NAMES][200];
     plot_series series[MAX_NAMES];
     char path[1024], title[300];
-    int n = columns_of(p, columns);
-    if (n > MAX_NAMES)
-        n = MAX_NAMES;
+    int n = plotted(p, columns, labels);
     for (int b = 0; b < p->budgets.count; ++b)
         x[b] = atof(p->budgets.at[b]); /* the training, where there is one */
     for (int c = 0; c < n; ++c) {
-        label(labels[c], sizeof labels[c], p, columns[c]);
         for (int b = 0; b < p->budgets.count; ++b)
             y[c][b] = overall_ratio(p, all, columns[c], columns[0], p->budgets.at[b], value_relmse).mean.value;
         series[c] = (plot_series){labels[c], x, y[c], p->budgets.count, c == 0};

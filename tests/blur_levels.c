@@ -57,7 +57,7 @@ static double check(gsd_simd level, gsdi_gauss_slot *slot, dn_border border)
     gsdi_gauss_full(level, m, slot->packed, WIDTH, w);
     error = worst(slot->packed, WIDTH, &truth);
     gsdi_gauss_map(child, LAYER, slot->map);
-    runs = gsdi_gauss_runs(slot->map, WIDTH, 0, WIDTH / GSDI_GAUSS_ROWS, slot->run);
+    runs = gsdi_gauss_runs(slot->map, WIDTH, slot->run);
     gsdi_gauss_packed(level, m, slot->packed, WIDTH, slot->run, runs, w);
     gsdi_gauss_unpack(slot->packed, slot->run, runs, m, stride);
     error = fmax(error, worst(m, stride, &truth));

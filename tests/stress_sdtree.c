@@ -9,6 +9,8 @@
 #define GSD_IMPLEMENTATION
 #include "guide_sdtree.h"
 
+#include "building.h"
+
 #define PI 3.14159265358979323846
 #define MOST 20000 /* samples of a batch */
 
@@ -1276,13 +1278,11 @@ static void queries(stress *s)
 /* Give the field's first `count` cells these trees as building trees, as if samples had made them. */
 static void plant_trees(stress *s, gsd_field *f, const gsd_tree *trees, uint32_t count)
 {
-    uint32_t nodes = f->building_nodes, all = nodes;
+    uint32_t more = 0;
     for (uint32_t c = 0; c < count; ++c)
-        all += 4 * trees[c].count + 1;
-    uint32_t *child = f->desc.allocate(f->desc.user, all * sizeof *child);
-    gsdi_sum *sum = f->desc.allocate(f->desc.user, all * sizeof *sum);
-    memcpy(child, f->child, nodes * sizeof *child);
-    memcpy(sum, f->sum, nodes * sizeof *sum);
+        more += 4 * trees[c].count + 1;
+    uint32_t nodes = more_building_nodes(f, more), *child = f->child;
+    gsdi_sum *sum = f->sum;
     for (uint32_t c = 0; c < count; ++c) { /* children of inner node i are 4 i + 1 .. 4 i + 4 */
         const gsd_tree *t = &trees[c];
         gsdi_state *state = &f->states[c];
@@ -1290,19 +1290,13 @@ static void plant_trees(stress *s, gsd_field *f, const gsd_tree *trees, uint32_t
         state->first = nodes;
         state->count = 4 * t->count + 1;
         state->held = state->fresh = state->lit = stress_log(s, 1, 1e9);
-        child[nodes] = 1;
-        memset(&sum[nodes++], 0, sizeof *sum);
+        child[nodes++] = 1;
         for (uint32_t k = 0; k < 4 * t->count; ++k, ++nodes) {
             child[nodes] = t->child[k] ? 4 * t->child[k] + 1 : 0;
             sum[nodes].half[0] = t->child[k] ? 0 : share * (double)t->value[k];
             sum[nodes].half[1] = t->child[k] ? 0 : (1 - share) * (double)t->value[k];
         }
     }
-    f->desc.release(f->desc.user, f->child);
-    f->desc.release(f->desc.user, f->sum);
-    f->child = child;
-    f->sum = sum;
-    f->building_nodes = f->node_capacity = nodes;
     gsdi_field_changed(f);
 }
 

@@ -15,6 +15,7 @@
 #define GSD_IMPLEMENTATION
 #include "guide_sdtree.h"
 
+#include "counter.h"
 #include "crowd.h"
 #include "rng.h"
 
@@ -41,47 +42,6 @@ static gsd_desc unit_cube(gsd_target target)
     d.bounds_max[0] = d.bounds_max[1] = d.bounds_max[2] = 1;
     d.target = target;
     return d;
-}
-
-/* An allocator that counts, and fails from the fail_at-th request on (for one request, or all with fail_all). */
-typedef struct counter {
-    long live, requests, fail_at;
-    size_t bytes, peak;
-    bool fail_all;
-} counter;
-
-static void *count_allocate(void *user, size_t size)
-{
-    counter *c = user;
-    c->requests++;
-    if (c->fail_at && (c->requests == c->fail_at || (c->fail_all && c->requests > c->fail_at)))
-        return NULL;
-    size_t *p = malloc(size + 16);
-    if (!p)
-        return NULL;
-    p[0] = size;
-    c->live++;
-    c->bytes += size;
-    c->peak = c->bytes > c->peak ? c->bytes : c->peak;
-    return (char *)p + 16;
-}
-
-static void count_release(void *user, void *pointer)
-{
-    counter *c = user;
-    if (!pointer)
-        return;
-    size_t *p = (size_t *)(void *)((char *)pointer - 16);
-    c->live--;
-    c->bytes -= p[0];
-    free(p);
-}
-
-static void use_counter(gsd_desc *d, counter *c)
-{
-    d->allocate = count_allocate;
-    d->release = count_release;
-    d->user = c;
 }
 
 /* A random quadtree as plain arrays: grows `inner` nodes, preferring deep ones, to max_depth. */

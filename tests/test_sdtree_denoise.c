@@ -13,6 +13,8 @@
 #define GSD_IMPLEMENTATION
 #include "guide_sdtree.h"
 
+#include "building.h"
+#include "counter.h"
 #include "crowd.h"
 #include "denoise_naive.h"
 #include "rng.h"
@@ -634,7 +636,7 @@ static void check_layer(const tree *t, const dn_tree *twin, const unsigned char 
         if (border == DN_SPHERE)
             assert_true(fabs(sum * t->mass[0] - dn_sum(&flat)) <= 1e-6 * dn_sum(&flat));
         gsdi_gauss_map(t->child, layer, slot->map);
-        runs = gsdi_gauss_runs(slot->map, width, 0, width / GSDI_GAUSS_ROWS, slot->run);
+        runs = gsdi_gauss_runs(slot->map, width, slot->run);
         gsdi_gauss_packed((gsd_simd)level, m, slot->packed, width, slot->run, runs, w);
         gsdi_gauss_unpack(slot->packed, slot->run, runs, m, stride);
         assert_near_matrix(m, stride, &truth, t->mass[0], "blocks");
@@ -729,25 +731,14 @@ static void test_gaussian_trees_match_the_twin(void **state)
 static void plant(gsd_field *f, uint32_t cell, const tree *t, double samples)
 {
     gsdi_state *s = &f->states[cell];
-    uint32_t nodes = f->building_nodes + t->count;
-    uint32_t *child = f->desc.allocate(f->desc.user, nodes * sizeof *child);
-    gsdi_sum *sum = f->desc.allocate(f->desc.user, nodes * sizeof *sum);
-    memcpy(child, f->child, f->building_nodes * sizeof *child);
-    memcpy(sum, f->sum, f->building_nodes * sizeof *sum);
-    memcpy(child + f->building_nodes, t->child, t->count * sizeof *child);
+    uint32_t first = more_building_nodes(f, t->count);
+    memcpy(f->child + first, t->child, t->count * sizeof *f->child);
     for (uint32_t i = 0; i < t->count; ++i) /* inner sums are scratch */
-        memset(&sum[f->building_nodes + i], 0, sizeof *sum);
-    for (uint32_t i = 0; i < t->count; ++i)
         if (!t->child[i])
-            sum[f->building_nodes + i] = t->sum[i];
-    s->first = f->building_nodes;
+            f->sum[first + i] = t->sum[i];
+    s->first = first;
     s->count = t->count;
     s->held = s->lit = s->fresh = samples;
-    f->desc.release(f->desc.user, f->child);
-    f->desc.release(f->desc.user, f->sum);
-    f->child = child;
-    f->sum = sum;
-    f->building_nodes = f->node_capacity = nodes;
     gsdi_field_changed(f);
 }
 
@@ -958,38 +949,11 @@ static void test_gaussian_survives_hostile_trees(void **state)
     assert_true(denoised >= 30);
 }
 
-/* An allocator that counts and fails. */
-typedef struct counter {
-    long live, requests, fail_at;
-    size_t bytes, peak;
-} counter;
-
-static void *count_allocate(void *user, size_t size)
-{
-    counter *c = user;
-    size_t *p = ++c->requests == c->fail_at ? NULL : malloc(size + 16);
-    if (!p)
-        return NULL;
-    *p = size;
-    c->live++;
-    c->bytes += size;
-    c->peak = c->bytes > c->peak ? c->bytes : c->peak;
-    return (char *)p + 16;
-}
-
-static void count_release(void *user, void *pointer)
-{
-    counter *c = user;
-    if (!pointer)
-        return;
-    c->live--;
-    c->bytes -= *(size_t *)(void *)((char *)pointer - 16);
-    free((char *)pointer - 16);
-}
-
 static gsd_field *loaded(counter *c, const void *data, size_t size)
 {
-    gsd_desc d = {.allocate = count_allocate, .release = count_release, .user = c};
+    gsd_desc d;
+    memset(&d, 0, sizeof d);
+    use_counter(&d, c);
     gsd_field *f;
     OK(gsd_load(&d, data, size, &f));
     return f;

@@ -113,36 +113,30 @@ void tr_worker_destroy(tr_worker *w)
 
 tr_counters *tr_worker_counters(tr_worker *w) { return &w->counters; }
 
+/* An array with room for `more` elements behind `count`: itself or a larger one in its place, NULL = out of memory. */
+static void *with_room(void *array, size_t size, int count, int more, int *capacity)
+{
+    if (count + more <= *capacity)
+        return array;
+    int larger = *capacity ? 2 * *capacity : 8 * TR_PATHS;
+    void *grown = realloc(array, size * (size_t)larger);
+    if (grown)
+        *capacity = larger;
+    return grown;
+}
+
 /* Room for what one bounce adds at most, so that the stages need not check. */
 static bool reserve(tr_worker *w, bool recording)
 {
     if (!recording)
         return true;
-    if (w->vertex_count + TR_PATHS > w->vertex_capacity) {
-        int capacity = w->vertex_capacity ? 2 * w->vertex_capacity : 8 * TR_PATHS;
-        tr_vertex *grown = realloc(w->vertices, sizeof *grown * (size_t)capacity);
-        if (!grown)
-            return false;
-        w->vertices = grown;
-        w->vertex_capacity = capacity;
-    }
-    if (w->link_count + 2 * TR_PATHS > w->link_capacity) {
-        int capacity = w->link_capacity ? 2 * w->link_capacity : 8 * TR_PATHS;
-        link *grown = realloc(w->links, sizeof *grown * (size_t)capacity);
-        if (!grown)
-            return false;
-        w->links = grown;
-        w->link_capacity = capacity;
-    }
-    if (w->trail_count + TR_PATHS > w->trail_capacity) {
-        int capacity = w->trail_capacity ? 2 * w->trail_capacity : 4 * TR_PATHS;
-        trail *grown = realloc(w->trails, sizeof *grown * (size_t)capacity);
-        if (!grown)
-            return false;
-        w->trails = grown;
-        w->trail_capacity = capacity;
-    }
-    return true;
+    tr_vertex *vertices = with_room(w->vertices, sizeof *vertices, w->vertex_count, TR_PATHS, &w->vertex_capacity);
+    w->vertices = vertices ? vertices : w->vertices;
+    link *links = with_room(w->links, sizeof *links, w->link_count, 2 * TR_PATHS, &w->link_capacity);
+    w->links = links ? links : w->links;
+    trail *trails = with_room(w->trails, sizeof *trails, w->trail_count, TR_PATHS, &w->trail_capacity);
+    w->trails = trails ? trails : w->trails;
+    return vertices && links && trails;
 }
 
 /* ---- >>camera ----------------------------------------------------------------------------------------------- */
@@ -603,7 +597,7 @@ static void find_free_slots(tr_worker *w)
 /* Paths that are expected to add little are ended by chance, paths that are expected to add much go on as several. */
 static void guided_roulette(tr_worker *w, const tr_frame *frame, bool recording)
 {
-    int kept = 0, count[TR_PATHS];
+    int kept = 0, added = 0, count[TR_PATHS];
     frame->method->reflected(frame->method_data, w->smooth_count, w->handles, w->reflected);
     for (int i = 0; i < w->active_count; ++i) {
         int id = w->active[i];
@@ -613,9 +607,12 @@ static void guided_roulette(tr_worker *w, const tr_frame *frame, bool recording)
         if (q < 1 && rng_float(&w->paths[id].guide_rng) >= q)
             continue;
         count[kept] = e > ROULETTE_HIGH ? (int)ceilf(tr_min(e / ROULETTE_HIGH, ROULETTE_MOST)) : 1;
+        added += count[kept] - 1;
         w->active[kept++] = id;
     }
     w->active_count = kept;
+    if (added == 0)
+        return;
     find_free_slots(w);
     for (int i = 0; i < kept; ++i)
         if (count[i] > 1)

@@ -6,9 +6,8 @@
    gate=on|off, gate_margin, gate_gain, gate_probe, guide_weight=on|off, history=on|off, denoise=on|off|gaussian,
    denoise_budget, denoise_when=training|last (in every refine, or only in that which ends --train); of
    denoise=gaussian: sigma, gaussian_rho, gaussian_sphere=off|on, gaussian_limit=on|off; uniform, alias=on|off,
-   simd=scalar|avx2|avx512|neon,
-   product=on|off (with the cosine), jitter=on|off (find looks up a jittered position), sparse=on|off (closed fields
-   record only some tiles). */
+   simd=scalar|avx2|avx512|neon, product=on|off (with the cosine), jitter=on|off (find looks up a jittered position),
+   sparse=on|off (closed fields record only some tiles). */
 #include <stdlib.h>
 #include <string.h>
 
@@ -29,8 +28,8 @@ typedef struct sdtree {
     uint64_t stream_peak;
     tr_parallel_fn parallel;
     void *parallel_user;
-    bool denoising; /* refine is at its denoise step, since: */
-    double denoise_start, denoise_seconds;
+    double denoise_start; /* CPU seconds when refine's denoise step began; 0 = it is not there */
+    double denoise_seconds;
 } sdtree;
 
 /* ---- options */
@@ -244,10 +243,9 @@ static void sdtree_flush(void *method)
 static void sdtree_on_step(void *method, const char *step)
 {
     sdtree *m = method;
-    if (m->denoising)
+    if (m->denoise_start > 0)
         m->denoise_seconds += tr_cpu_seconds() - m->denoise_start;
-    m->denoising = step && !strcmp(step, "denoise");
-    m->denoise_start = m->denoising ? tr_cpu_seconds() : 0;
+    m->denoise_start = step && !strcmp(step, "denoise") ? tr_cpu_seconds() : 0;
 }
 
 static bool sdtree_end_pass(void *method, const tr_pass *pass)

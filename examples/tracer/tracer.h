@@ -375,8 +375,7 @@ void tr_closure_prefetch(const tr_scene *scene, const tr_surface *surface);
 /* Smooth part: f (1/sr, without cosine) and, where pdf is not NULL, its sampling density. wi in world space.
    The cosine to use with f is |dot(closure->frame.n, wi)|. Zero outside its support. */
 vec3 tr_closure_eval(const tr_closure *closure, vec3 wi, float *pdf);
-/* Draw wi (world) from the smooth part; u in [0,1). False = no direction (count as zero). f, pdf as eval has
-   them. */
+/* Draw wi (world) from the smooth part; u in [0,1). False = no direction (count as zero). f, pdf as from eval. */
 bool tr_closure_sample(const tr_closure *closure, float u_lobe, float u1, float u2, vec3 *wi, vec3 *f, float *pdf);
 /* Draw from the delta part: weight = f cos / probability of this direction within the delta part. eta_scale: square
    of the relative index when the path refracts (1 otherwise), by which roulette corrects the throughput. */
@@ -517,8 +516,7 @@ const tr_method *const *tr_method_list(void);      /* NULL-terminated */
 
 /* Guided roulette compares what a vertex is expected to add with what its pixel needs (Vorba and Krivanek 2016): paths
    that promise little are ended by chance, paths that promise much go on as several. It asks the method, and is off
-   where the method cannot tell. Throughput: the product of albedos, from the 5th edge
-   on. */
+   where the method cannot tell. Throughput: product of albedos, from edge 5 on. */
 typedef enum tr_roulette { TR_ROULETTE_GUIDED, TR_ROULETTE_OFF, TR_ROULETTE_THROUGHPUT } tr_roulette;
 
 typedef struct tr_settings {
