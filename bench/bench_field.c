@@ -8,6 +8,8 @@
    time per sample or query grows worse than logarithmically, or its scores depend on the scene's size. */
 #define GSD_IMPLEMENTATION
 #include "field_sdtree.h"
+#define GKD_IMPLEMENTATION
+#include "field_kd.h"
 #include "field_none.h"
 #include "field_openpgl.h"
 #include "plot.h"
@@ -16,8 +18,8 @@
 #include <stdarg.h>
 
 static const field_method *const all_methods[] = {
-    &field_none_method,    &field_sdtree_method,       &field_sdtree_switching_method,
-    &field_openpgl_method, &field_openpgl_4000_method, &field_openpgl_quadtree_method};
+    &field_none_method,     &field_sdtree_method,  &field_sdtree_switching_method, &field_kd_method,
+    &field_kd_count_method, &field_openpgl_method, &field_openpgl_4000_method,     &field_openpgl_quadtree_method};
 #define METHODS ((int)(sizeof all_methods / sizeof *all_methods))
 #define MAX_FIELDS 32
 #define MAX_SIZES 24
@@ -74,7 +76,7 @@ static double score_pdf(void *user, const sf1_point *point, const double *direct
         n[k] = (float)point->n[k];
         w[k] = (float)direction[k];
     }
-    field_place place = {p, cosine ? n : NULL};
+    field_place place = {p, cosine ? n : NULL, n};
     return s->method->pdf(s->state, place, w);
 }
 

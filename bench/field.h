@@ -51,7 +51,7 @@ static inline const char *field_record_chunk(const field_setup *setup, void *sta
         if (!sf1_draw(setup->field, rng, update, setup->exact, s))
             continue;
         field_scale(s, setup->extent);
-        field_place place = {s->position, s->normal};
+        field_place place = {s->position, s->normal, s->normal};
         guide[count++] = (float)setup->method->pdf(state, place, s->direction);
     }
     double start = bench_seconds();
@@ -118,7 +118,7 @@ static inline double field_run_queries(const field_method *m, void *state, const
 {
     double sum = 0;
     for (int i = 0; i < FIELD_QUERIES; ++i) {
-        field_place place = {q->position[i], q->normal[i]};
+        field_place place = {q->position[i], q->normal[i], q->normal[i]};
         float sampled[3];
         double given;
         sum += m->query(state, place, q->u[i], q->given[i], sampled, &given) + given;
@@ -151,7 +151,8 @@ static inline const char *field_check(const field_method *m, void *state, const 
         static const double up[3] = {0, 0, 1};
         double w[3];
         float d[3];
-        field_place place = {q->position[i], normals ? q->normal[i] : NULL};
+        const float *normal = normals ? q->normal[i] : NULL;
+        field_place place = {q->position[i], normal, normal};
         double sampled = m->query(state, place, q->u[i], q->given[i], d, &given), pdf = m->pdf(state, place, d);
         differ += !(fabs(sampled - pdf) <= 1e-3 * fmax(sampled, pdf));
         if (!(given >= 0) || !(sampled > 0) || !isfinite(given) || !isfinite(sampled))

@@ -4,10 +4,11 @@
 
 #include "sf1.h"
 
-/* Where a direction is asked for. The cube is [0, extent]^3; normal NULL = directions of the whole sphere, else the
-   method may multiply the surface's cosine in. */
+/* Where a direction is asked for. The cube is [0, extent]^3; normal NULL = density of radiance alone, else the method
+   may multiply the surface's cosine in. surface: the normal even where the cosine is not wanted, for methods that leave
+   out what lies below; NULL = directions of the whole sphere. */
 typedef struct field_place {
-    const float *position, *normal;
+    const float *position, *normal, *surface;
 } field_place;
 
 /* Functions that return text return NULL where all went well, else what went wrong. */

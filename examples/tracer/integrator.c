@@ -809,14 +809,16 @@ static void carry_back(tr_worker *w)
 {
     for (int t = w->trail_count; t-- > 0;) {
         vec3 incident = v3s(0);
+        float beyond = 0; /* from `next`, where it is a delta vertex, to what is seen in it */
         const link *next = NULL;
         for (int at = w->trails[t].last; at >= 0; at = w->links[at].previous) {
             const link *l = &w->links[at];
+            beyond = next ? next->distance + (next->vertex < 0 ? beyond : 0) : 0;
             if (l->vertex >= 0) {
                 tr_vertex *v = &w->vertices[l->vertex];
                 v->L = incident;
                 if (next) {
-                    v->distance = next->distance;
+                    v->distance = beyond;
                     v->next_normal = next->normal;
                 }
             }

@@ -8,11 +8,8 @@
    denoise=gaussian: sigma, gaussian_rho, gaussian_sphere=off|on, gaussian_limit=on|off; uniform, alias=on|off,
    simd=scalar|avx2|avx512|neon, product=on|off (with the cosine), jitter=on|off (find looks up a jittered position),
    sparse=on|off (closed fields record only some tiles). */
-#include <stdlib.h>
-#include <string.h>
-
+#include "method_options.h"
 #include "threads.h"
-#include "tracer.h"
 
 #define GSD_IMPLEMENTATION
 #include "guide_sdtree.h"
@@ -33,59 +30,6 @@ typedef struct sdtree {
 } sdtree;
 
 /* ---- options */
-
-static const char *option(tr_method_env *env, const char *key)
-{
-    for (int i = 0; i < env->option_count; ++i)
-        if (!strcmp(env->options[i].key, key)) {
-            env->options[i].used = true;
-            return env->options[i].value;
-        }
-    return NULL;
-}
-
-typedef struct parser {
-    tr_method_env *env;
-    char *err;
-    size_t err_size;
-    bool ok;
-} parser;
-
-static void complain(parser *p, const char *key, const char *value, const char *expected)
-{
-    if (p->ok)
-        snprintf(p->err, p->err_size, "--set %s=%s: expected %s", key, value, expected);
-    p->ok = false;
-}
-
-/* Index of the value among names separated by '|', -1 where the option was not given. */
-static int choice(parser *p, const char *key, const char *names)
-{
-    const char *value = option(p->env, key), *at = names;
-    for (int i = 0; value; ++i) {
-        size_t n = strcspn(at, "|");
-        if (strlen(value) == n && !strncmp(value, at, n))
-            return i;
-        if (!at[n]) {
-            complain(p, key, value, names);
-            break;
-        }
-        at += n + 1;
-    }
-    return -1;
-}
-
-static double number(parser *p, const char *key, double fallback)
-{
-    const char *value = option(p->env, key);
-    if (!value)
-        return fallback;
-    char *end;
-    double x = strtod(value, &end);
-    if (end == value || *end || !(x >= 0))
-        complain(p, key, value, "a number >= 0");
-    return x;
-}
 
 static bool parse(parser *p, gsd_desc *d, sdtree *m)
 {

@@ -410,7 +410,8 @@ vec3 tr_environment(const tr_scene *scene, vec3 direction);
    passes through them. */
 typedef struct tr_vertex {
     vec3 p, ng, ns, wo, wi;
-    float distance;   /* to the next vertex (surface), +INFINITY = the environment */
+    float distance;   /* along the path to the next vertex that is not delta: a mirror's picture lies behind it;
+                         +INFINITY = the environment */
     vec3 next_normal; /* geometric normal there, 0 for the environment */
     vec3 L;           /* incident radiance estimate from wi: w_light Le + reflected, see README "What is recorded" */
     vec3 f;           /* smooth bsdf, without cosine */

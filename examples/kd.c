@@ -1,0 +1,154 @@
+/* A complete path tracer with and without guiding: a room that gets its light through a door that is ajar.
+   cc -O2 -I. examples/kd.c -lembree3 -lm -o kd && ./kd      (or -lembree4)
+   Writes kd.pgm (left without, right with guiding, equal samples) and prints the errors against a longer render. */
+#define GKD_IMPLEMENTATION
+#include "guide_kd.h"
+#include <stdio.h>
+#if __has_include(<embree4/rtcore.h>)
+#include <embree4/rtcore.h>
+#else
+#include <embree3/rtcore.h>
+#endif
+
+static const struct box { // corners, grey of the surface, radiance of a lamp
+    float corner[2][3], grey, light;
+} boxes[] = {{{{0, 0, 0}, {3, 2, 1.5f}}, 0.3f, 0},                   // the walls, seen from inside
+             {{{2, 0, 0}, {2.05f, 0.7f, 1.5f}}, 0.3f, 0},            // the wall with the door,
+             {{{2, 0.85f, 0}, {2.05f, 2, 1.5f}}, 0.3f, 0},           // which is ajar
+             {{{0.9f, 1.2f, 0}, {1.2f, 1.5f, 0.8f}}, 0.6f, 0},       // something in the room
+             {{{2.9f, 0.2f, 0.2f}, {2.95f, 1.2f, 1.2f}}, 0.5f, 10}}; // the lamp behind the door
+enum { W = 96, H = 72, PIXELS = W * H, MAX_DEPTH = 12, BOXES = sizeof boxes / sizeof *boxes };
+static RTCScene scene;
+
+static float rnd(void) // in [0, 1)
+{
+    static unsigned long long s = 1;
+    return (float)((s = s * 6364136223846793005u + 1442695040888963407u) >> 40) / 16777216.0f;
+}
+static float dot(const float *a, const float *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+// The box that the ray hits; moves p there; n is the normal on the ray's side.
+static const struct box *trace(float *p, const float *d, float *n)
+{
+    struct RTCRayHit r = {.ray = {p[0], p[1], p[2], 1e-4f, d[0], d[1], d[2], 0, 1e9f, ~0u, 0, 0}};
+    r.hit.geomID = RTC_INVALID_GEOMETRY_ID;
+#if RTC_VERSION_MAJOR >= 4
+    rtcIntersect1(scene, &r, NULL);
+#else
+    struct RTCIntersectContext context;
+    rtcInitIntersectContext(&context);
+    rtcIntersect1(scene, &context, &r);
+#endif
+    float ng[3] = {r.hit.Ng_x, r.hit.Ng_y, r.hit.Ng_z}, scale = (dot(ng, d) > 0 ? -1 : 1) / sqrtf(dot(ng, ng));
+    for (int k = 0; k < 3; ++k) {
+        n[k] = ng[k] * scale;
+        p[k] += r.ray.tfar * d[k];
+    }
+    return r.hit.geomID == RTC_INVALID_GEOMETRY_ID ? NULL : &boxes[r.hit.primID / 6];
+}
+
+static void sample_cosine(const float *n, float *d) // a point on the unit sphere around the tip of n
+{
+    float z = 1 - 2 * rnd(), phi = 6.2831853f * rnd(), r = sqrtf(1 - z * z);
+    float v[3] = {n[0] + r * cosf(phi), n[1] + r * sinf(phi), n[2] + z}, length = sqrtf(dot(v, v)) + 1e-9f;
+    for (int k = 0; k < 3; ++k)
+        d[k] = v[k] / length;
+}
+
+// Radiance along one camera path; stream = NULL: unguided.
+static float radiance(float *p, float *d, const gkd_view *field, gkd_stream *stream)
+{
+    gkd_training_sample vertex[MAX_DEPTH]; // what to learn: filled in on the way, completed on the way back
+    float n[3], f_cos[MAX_DEPTH];
+    int count = 0;
+    const struct box *hit = trace(p, d, n);
+    while (hit && !(hit->light > 0) && count < MAX_DEPTH) { // lamps do not reflect
+        float u[2] = {rnd(), rnd()};
+        gkd_handle handle;
+        gkd_find(field, p, n, NULL, &handle);    // 1. Find the cell, and its lobes as seen from here.
+        float alpha = stream ? handle.alpha : 1; //    How often it wants the BSDF.
+        if (rnd() < alpha)                       // 2. One-sample MIS: draw from one of the two ...
+            sample_cosine(n, d);
+        else
+            gkd_sample(&handle, u, d);
+        float cosine = dot(n, d), pdf_bsdf = cosine > 0 ? cosine / 3.14159265f : 0;
+        float pdf_guide = alpha < 1 ? gkd_pdf(&handle, d) : 0;
+        float pdf = alpha * pdf_bsdf + (1 - alpha) * pdf_guide; // ... and divide by the density of both.
+        f_cos[count] = hit->grey / 3.14159265f * cosine;
+        float at[3] = {p[0], p[1], p[2]}, normal[3] = {n[0], n[1], n[2]};
+        hit = cosine > 0 ? trace(p, d, n) : NULL; // 3. How far away is what the lobe shows?
+        float gone[3] = {p[0] - at[0], p[1] - at[1], p[2] - at[2]}, distance = cosine > 0 ? sqrtf(dot(gone, gone)) : 1;
+        vertex[count++] = gkd_make_scalar_sample(at, d, normal, distance + 1e-6f, cosine > 0 ? 0 : GKD_REJECTED, 0, 0,
+                                                 pdf, pdf_bsdf, pdf_guide);
+    }
+    float L = hit ? hit->light : 0;
+    for (int i = count - 1; i >= 0 && L > 0; --i) { // 4. Back along the path: L comes from vertex[i].direction.
+        vertex[i].radiance = L;
+        vertex[i].contribution = vertex[i].pixel_contribution = f_cos[i] * L;
+        L *= f_cos[i] / vertex[i].pdf_mix;
+    }
+    if (stream)
+        gkd_record(stream, vertex, (uint32_t)count);
+    return L;
+}
+
+// Mean of 2^passes - 1 samples per pixel, in passes of 1, 2, 4, ...
+static void render(float *image, int passes, gkd_field *field, gkd_stream *stream)
+{
+    for (int pass = 0; pass < passes; ++pass) {
+        gkd_view view = gkd_get_view(field);
+        for (int i = 0; i < PIXELS << pass; ++i) {
+            float x = ((float)(i % W) + rnd()) / W - 0.5f, y = ((float)(i / W % H) + rnd()) / H - 0.5f;
+            float p[3] = {1, 0.05f, 0.75f}, d[3] = {1.2f * x, 1, -0.9f * y}, length = sqrtf(dot(d, d));
+            for (int k = 0; k < 3; ++k)
+                d[k] /= length;
+            image[i % PIXELS] += radiance(p, d, &view, stream) / (float)((1 << passes) - 1);
+        }
+        if (stream) { // 5. Learn from the pass.
+            gkd_accumulate(field, &stream, 1, NULL, NULL);
+            gkd_stream_clear(stream);
+            gkd_refine(field, NULL, NULL, NULL);
+        }
+    }
+}
+
+int main(void)
+{
+    static const unsigned char quad[24] = {0, 2, 6, 4, 1, 5, 7, 3, 0, 4, 5, 1, 2, 3, 7, 6, 0, 1, 3, 2, 4, 6, 7, 5};
+    static float image[3][PIXELS]; // unguided, guided, reference
+    double error[2] = {0, 0};
+    gkd_desc desc = {.bounds_max = {3, 2, 1.5f}}; // the rest: defaults
+    gkd_field *field;
+    gkd_stream *stream;
+    FILE *file = fopen("kd.pgm", "wb");
+    RTCDevice device = rtcNewDevice(NULL);
+    if (!device || !file || gkd_create(&desc, &field) || gkd_stream_create(field, &stream))
+        return 1;
+    RTCGeometry g = rtcNewGeometry(device, RTC_GEOMETRY_TYPE_QUAD); // one mesh; quad i belongs to box i / 6
+    float *v = rtcSetNewGeometryBuffer(g, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, 12, 8 * BOXES);
+    unsigned *index = rtcSetNewGeometryBuffer(g, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT4, 16, 6 * BOXES);
+    for (int i = 0; i < 24 * BOXES; ++i) {
+        v[i] = boxes[i / 24].corner[i / 3 % 8 >> i % 3 & 1][i % 3];
+        index[i] = (unsigned)(i / 24 * 8 + quad[i % 24]);
+    }
+    scene = rtcNewScene(device);
+    rtcCommitGeometry(g);
+    rtcAttachGeometry(scene, g);
+    rtcReleaseGeometry(g);
+    rtcCommitScene(scene);
+    render(image[0], 7, field, NULL);
+    render(image[1], 7, field, stream);
+    render(image[2], 8, field, stream); // goes on learning
+    fprintf(file, "P5 %d %d 255\n", 2 * W, H);
+    for (int i = 0; i < 2 * PIXELS; ++i) {
+        int side = i / W % 2, pixel = i / (2 * W) * W + i % W;
+        double grey = 255 * sqrt(9 * image[side][pixel]);
+        error[side] += pow(image[side][pixel] - image[2][pixel], 2) / PIXELS;
+        fputc(grey < 255 ? (int)grey : 255, file);
+    }
+    printf("squared error at 127 samples per pixel: %.2e without, %.2e with guiding\n", error[0], error[1]);
+    fclose(file);
+    gkd_stream_destroy(stream);
+    gkd_destroy(field);
+    return 0;
+}
