@@ -3491,22 +3491,23 @@ static void gkdi_update_cells(void *context, uint32_t begin, uint32_t end)
 {
     gkdi_update *u = (gkdi_update *)context;
     const gkd_desc *desc = &u->field->desc;
+    gkdi_cell_samples batch;
     uint32_t k;
+    size_t n = 0;
+    for (k = begin; k < end; ++k)
+        n = u->outcomes[k].end - u->outcomes[k].first > n ? u->outcomes[k].end - u->outcomes[k].first : n;
+    batch.items = (gkdi_item *)desc->allocate(desc->user, n * 2 * sizeof *batch.items);
+    batch.zeros = (float(*)[3])desc->allocate(desc->user, n * 2 * sizeof *batch.zeros);
     for (k = begin; k < end; ++k) {
-        gkdi_outcome *o = &u->outcomes[k];
-        uint64_t n = o->end - o->first;
-        gkdi_cell_samples batch;
-        batch.items = (gkdi_item *)desc->allocate(desc->user, (size_t)n * 2 * sizeof *batch.items);
-        batch.zeros = (float(*)[3])desc->allocate(desc->user, (size_t)n * 2 * sizeof *batch.zeros);
-        o->failed = !batch.items || !batch.zeros;
-        if (!o->failed) {
-            batch.other_items = batch.items + n;
-            batch.other_zeros = batch.zeros + n;
-            gkdi_update_cell(u, o, &batch);
-        }
-        gkdi_release(desc, batch.items);
-        gkdi_release(desc, batch.zeros);
+        u->outcomes[k].failed = !batch.items || !batch.zeros;
+        if (u->outcomes[k].failed)
+            continue;
+        batch.other_items = batch.items + n;
+        batch.other_zeros = batch.zeros + n;
+        gkdi_update_cell(u, &u->outcomes[k], &batch);
     }
+    gkdi_release(desc, batch.items);
+    gkdi_release(desc, batch.zeros);
 }
 
 static bool gkdi_finite(float x) { return x - x == 0; }
@@ -3748,7 +3749,7 @@ static gkd_result gkdi_do_update(gkd_field *field, gkd_parallel_fn parallel, voi
             double share = (double)(u.outcomes[k].end - u.outcomes[k].first) / (double)u.count;
             u.outcomes[k].room = (uint32_t)fmin((double)allowed * share, 1e6);
         }
-        gkdi_run(parallel, user, u.outcome_count, 1, gkdi_update_cells, &u);
+        gkdi_run(parallel, user, u.outcome_count, 4, gkdi_update_cells, &u);
         for (i = 0; i < field->node_count; ++i)
             if (field->nodes[i].link & GKD_LEAF)
                 start[field->nodes[i].link & ~GKD_LEAF] = i;
