@@ -898,11 +898,17 @@ GKD_QUERY bool gkd_pack_direction(const float direction[3], const float *normal,
     return valid;
 }
 
-/* Direction (unit) and normal (zero where there is none) of a sample. [any thread] */
-GKD_QUERY void gkd_unpack_direction(const uint32_t packed[2], float direction[3], float normal[3])
+/* Direction (unit) of a sample. [any thread] */
+GKD_QUERY void gkd_unpack_direction(const uint32_t packed[2], float direction[3])
 {
-    gkd_from_octahedral(((float)(packed[0] & 0xffffffu) - 8388608.0f) / 8388607.0f,
-                        ((float)(packed[1] & 0xffffffu) - 8388608.0f) / 8388607.0f, direction);
+    const float step = 1.0f / 8388607;
+    gkd_from_octahedral(((float)(int32_t)(packed[0] & 0xffffffu) - 8388608.0f) * step,
+                        ((float)(int32_t)(packed[1] & 0xffffffu) - 8388608.0f) * step, direction);
+}
+
+/* Normal of a sample; zero where it has none. [any thread] */
+GKD_QUERY void gkd_unpack_normal(const uint32_t packed[2], float normal[3])
+{
     normal[0] = normal[1] = normal[2] = 0;
     if (packed[0] >> 24)
         gkd_from_octahedral(((float)(packed[0] >> 24) - 128) / 127, ((float)(packed[1] >> 24) - 128) / 127, normal);
@@ -3349,10 +3355,11 @@ static bool gkdi_split_parts(const gkd_field *field, gkdi_outcome *o, uint32_t a
 }
 
 /* The guide's density of a sample whose vertex did not ask for it. */
-static float gkdi_sample_pdf(const gkd_view *view, const gkd_training_sample *s, const float direction[3],
-                             const float normal[3])
+static float gkdi_sample_pdf(const gkd_view *view, const gkd_training_sample *s, const float direction[3])
 {
     gkd_handle handle;
+    float normal[3];
+    gkd_unpack_normal(s->direction, normal);
     gkd_find(view, s->position, normal, NULL, &handle);
     return gkd_pdf(&handle, direction);
 }
@@ -3369,12 +3376,12 @@ static void gkdi_take_samples(const gkdi_update *u, const gkdi_outcome *o, gkdi_
         const gkd_training_sample *s = &u->samples[u->order[i]];
         bool rejected = s->radiance == 0 && signbit(s->radiance);
         double p = (double)s->pdf_mix, pg = (double)s->pdf_guide, g = rejected ? 0 : (double)s->contribution;
-        float direction[3], normal[3], position[3];
+        float direction[3], position[3];
         for (k = 0; k < 3; ++k) {
             float x = s->position[k] > desc->bounds_min[k] ? s->position[k] : desc->bounds_min[k];
             position[k] = x < desc->bounds_max[k] ? x : desc->bounds_max[k];
         }
-        gkd_unpack_direction(s->direction, direction, normal);
+        gkd_unpack_direction(s->direction, direction);
         c->gate.fresh += 1;
         c->gate.flow += g / p < 1e30 ? g / p : 1e30;
         if (judge && (c->gate.hits < GKDI_ENOUGH_HITS || ((uint32_t)(int64_t)c->gate.fresh & 7u) == 0)) {
@@ -3382,7 +3389,7 @@ static void gkdi_take_samples(const gkdi_update *u, const gkdi_outcome *o, gkdi_
             if (g > 0) {
                 bool guided = c->gate.rebuilds > 0;
                 if (guided && !(pg > 0))
-                    pg = (double)gkdi_sample_pdf(&view, s, direction, normal);
+                    pg = (double)gkdi_sample_pdf(&view, s, direction);
                 c->gate.hits++;
                 gkdi_gate_add(&c->gate, g, (double)s->pixel_contribution, p, (double)s->pdf_bsdf,
                               guided ? pg : (double)s->pdf_bsdf); /* without a mixture: neutral */
