@@ -1015,6 +1015,9 @@ GKD_API void gkd_pdf_directions(const gkd_view *view, const gkd_handle *handle, 
     128.0                         /* effective non-zero samples for the verdict "this mixture does not pay"; fewer     \
                                      closes cells whose light is rarely found */
 #define GKDI_MIN_EVEN 32.0        /* for "too even to pay" */
+#define GKDI_MIN_EVEN_REBUILDS                                                                                         \
+    8 /* and before that verdict: the first cells are large, and have not yet found light that is rare; without it all \
+         of pool closes at once */
 #define GKDI_MIN_OPEN 4.0         /* for "pays" */
 #define GKDI_ENOUGH_HITS 256u     /* non-zero samples of a cell and pass; from then on the gate takes one of eight */
 #define GKDI_REFLECTED_SAMPLES 32 /* of a cell and pass, for its mean reflected radiance to count */
@@ -2954,7 +2957,7 @@ static void gkdi_verdict(const gkd_desc *desc, bool pixels, gkdi_gate *s, gkd_st
         s->verdict = GKD_GATE_OPEN;
     } else if (closed) { /* not as even as it seemed */
         s->verdict = mean > 0 && even - even_error > 1.5 * limit ? GKD_GATE_UNJUDGED : GKD_GATE_CLOSED;
-    } else if ((even + even_error < limit && n >= GKDI_MIN_EVEN) ||
+    } else if ((even + even_error < limit && n >= GKDI_MIN_EVEN && s->rebuilds >= GKDI_MIN_EVEN_REBUILDS) ||
                (mean + error < 0 && n >= GKDI_MIN_EFFECTIVE && s->rebuilds >= GKDI_MIN_REBUILDS)) {
         stats->closed++;
         s->verdict = GKD_GATE_CLOSED;
