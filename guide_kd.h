@@ -1021,6 +1021,9 @@ GKD_API void gkd_pdf_directions(const gkd_view *view, const gkd_handle *handle, 
     128.0                         /* effective non-zero samples for the verdict "this mixture does not pay"; fewer     \
                                      closes cells whose light is rarely found */
 #define GKDI_MIN_EVEN 32.0        /* for "too even to pay" */
+#define GKDI_MIN_EVEN_REBUILDS                                                                                         \
+    8 /* and before that verdict: the first cells are large, and have not yet found light that is rare; without it all \
+         of pool closes at once */
 #define GKDI_MIN_OPEN 4.0         /* for "pays" */
 #define GKDI_ENOUGH_HITS 256u     /* non-zero samples of a cell and pass; from then on the gate takes one of eight */
 #define GKDI_REFLECTED_SAMPLES 32 /* of a cell and pass, for its mean reflected radiance to count */
@@ -1637,7 +1640,8 @@ typedef struct gkdi_model {
     float pivot[3];
     uint32_t count; /* lobes; 0 = nothing learned */
     float held;     /* effective samples in the sums; sum of soft */
-    float level;    /* mean weight of those samples */
+    float level;    /* mean weight of the samples that they stand for */
+    float samples;  /* whose number that is */
     uint32_t seen;  /* samples in all, whatever their weight, decayed or not; saturates */
     gkdi_sums sums;
 } gkdi_model;
@@ -1690,7 +1694,7 @@ static inline gkdi_fit_options gkdi_fit_defaults(void)
     o.split_sigma = 4;
     o.split_price = 4;
     o.merge = 0.006f;
-    o.share = 1;
+    o.share = 2;
     o.parallax = 4;
     o.jacobian = true;
     return o;
@@ -2670,7 +2674,9 @@ static inline void gkdi_total(gkdi_model *m, double level)
     m->level = (float)level;
 }
 
-/* Learns from items: all of the batch in one call. The model's pivot must be set. */
+/* Learns from items: all of the batch in one call. The model's pivot must be set. History and batch count as much as
+   the light that they have seen, and the sums are scaled to the effective number of both together (own): a batch of
+   few effective samples is one that has found light that is rare and bright, and must not count for less. */
 static inline void gkdi_model_fit(gkdi_model *m, const gkdi_item *items, uint32_t n, const gkdi_fit_options *o)
 {
     gkdi_mixture q;
@@ -2682,22 +2688,26 @@ static inline void gkdi_model_fit(gkdi_model *m, const gkdi_item *items, uint32_
     if (!(w.sum > 0))
         return;
     double held = m->count ? (double)m->held * (double)o->history : 0, old = (double)m->level, level;
+    double samples = m->count ? (double)m->samples * (double)o->history : 0, total, mass;
     double now = gkdi_max(w.sum / n, 1e-37);
     if (held > 0)
         gkdi_level(held, &old, w.effective, &now);
-    level = (held * old + w.effective * now) / (held + w.effective);
+    samples = held > 0 ? samples : 0;
+    level = (samples * old + n * now) / (samples + n);
+    mass = n * now / (samples * old + n * now);
+    total = held > 0 ? 1 / ((1 - mass) * (1 - mass) / held + mass * mass / w.effective) : w.effective;
     memcpy(view.pivot, m->pivot, sizeof view.pivot);
     view.jacobian = o->jacobian;
     view.nearest = (float)gkdi_min((double)o->parallax / gkdi_max(sqrt(gkdi_radius2(items, n, m->pivot)), 1e-18), 1e18);
     view.cap = (float)w.cap;
     view.inverse = 1 / view.cap;
-    view.scale = (float)(w.effective * (now / level) / (w.sum / w.cap));
+    view.scale = (float)(mass * total / (w.sum / w.cap));
     view.sum = w.sum;
     view.stride = 1;
     memset(&history, 0, sizeof history);
     if (m->count) {
         history = m->sums;
-        gkdi_scale(&history, m->count, (double)o->history * old / level);
+        gkdi_scale(&history, m->count, held > 0 ? (1 - mass) * total / (double)m->held : 0);
         gkdi_maximise(&history, m->count, o, &q);
         if (m->seen < o->seed_seen)
             gkdi_seed(items, n, &view, o, &q);
@@ -2708,6 +2718,7 @@ static inline void gkdi_model_fit(gkdi_model *m, const gkdi_item *items, uint32_
     gkdi_iterate(m, &q, &history, items, n, &view, o->passes, o, o->likelihood);
     m->count = gkdi_merge_all(o, &q, &m->sums, m->count);
     m->seen = m->seen > UINT32_MAX - n ? UINT32_MAX : m->seen + n;
+    m->samples = (float)(samples + n);
     gkdi_total(m, level);
 }
 
@@ -2733,6 +2744,7 @@ static inline void gkdi_model_decay(gkdi_model *m, float factor)
 {
     gkdi_scale(&m->sums, m->count, (double)factor);
     m->held *= factor;
+    m->samples *= factor;
 }
 
 /* The same light seen from another pivot: means turn, and a lobe at finite distance becomes sharper and weaker with
@@ -2780,11 +2792,15 @@ static inline void gkdi_model_merge(gkdi_model *a, const gkdi_model *b, const gk
         *a = c;
         return;
     }
-    double la = (double)a->level, lb = (double)c.level, ha = (double)a->held, hb = (double)c.held, level;
+    double la = (double)a->level, lb = (double)c.level, ha = (double)a->held, hb = (double)c.held, level, mass, total;
     gkdi_level(ha, &la, hb, &lb);
-    level = (ha * la + hb * lb) / (ha + hb);
-    gkdi_scale(&a->sums, a->count, la / level);
-    gkdi_scale(&c.sums, c.count, lb / level);
+    level = (double)a->samples * la + (double)c.samples * lb;
+    mass = level > 0 ? (double)c.samples * lb / level : 0.5;
+    total = 1 / ((1 - mass) * (1 - mass) / gkdi_max(ha, 1e-30) + mass * mass / gkdi_max(hb, 1e-30));
+    gkdi_scale(&a->sums, a->count, (1 - mass) * total / gkdi_max(ha, 1e-30));
+    gkdi_scale(&c.sums, c.count, mass * total / gkdi_max(hb, 1e-30));
+    a->samples += c.samples;
+    level /= gkdi_max((double)a->samples, 1e-30);
     for (uint32_t k = 0; k < c.count; ++k) {
         uint32_t to = !k && o->broad_kappa > 0 ? 0 : a->count;
         if (to == GKD_MAX_LOBES) { /* into the lobe of nearest mean */
@@ -2805,26 +2821,26 @@ static inline void gkdi_model_merge(gkdi_model *a, const gkdi_model *b, const gk
     gkdi_total(a, level);
 }
 
-/* Packed form: 7 + 5 * count words of 32 bits. Returns the words written. */
-static inline uint32_t gkdi_model_words(uint32_t count) { return 7 + 5 * count; }
+/* Packed form: 8 + 5 * count words of 32 bits. Returns the words written. */
+static inline uint32_t gkdi_model_words(uint32_t count) { return 8 + 5 * count; }
 static inline uint32_t gkdi_model_pack(const gkdi_model *m, void *out)
 {
     unsigned char *p = (unsigned char *)out;
     const float *from[5] = {m->sums.soft, m->sums.x, m->sums.y, m->sums.z, m->sums.nearness};
-    memcpy(p, m, 28);
+    memcpy(p, m, 32);
     for (int i = 0; i < 5; ++i)
-        memcpy(p + 28 + 4 * (size_t)i * m->count, from[i], 4 * (size_t)m->count);
+        memcpy(p + 32 + 4 * (size_t)i * m->count, from[i], 4 * (size_t)m->count);
     return gkdi_model_words(m->count);
 }
 static inline uint32_t gkdi_model_unpack(gkdi_model *m, const void *in)
 {
     const unsigned char *p = (const unsigned char *)in;
-    memcpy(m, p, 28);
+    memcpy(m, p, 32);
     float *to[5] = {m->sums.soft, m->sums.x, m->sums.y, m->sums.z, m->sums.nearness};
     if (m->count > GKD_MAX_LOBES) /* only from a damaged file */
         m->count = 0;
     for (int i = 0; i < 5; ++i)
-        memcpy(to[i], p + 28 + 4 * (size_t)i * m->count, 4 * (size_t)m->count);
+        memcpy(to[i], p + 32 + 4 * (size_t)i * m->count, 4 * (size_t)m->count);
     return gkdi_model_words(m->count);
 }
 
@@ -2947,7 +2963,7 @@ static void gkdi_verdict(const gkd_desc *desc, bool pixels, gkdi_gate *s, gkd_st
         s->verdict = GKD_GATE_OPEN;
     } else if (closed) { /* not as even as it seemed */
         s->verdict = mean > 0 && even - even_error > 1.5 * limit ? GKD_GATE_UNJUDGED : GKD_GATE_CLOSED;
-    } else if ((even + even_error < limit && n >= GKDI_MIN_EVEN) ||
+    } else if ((even + even_error < limit && n >= GKDI_MIN_EVEN && s->rebuilds >= GKDI_MIN_EVEN_REBUILDS) ||
                (mean + error < 0 && n >= GKDI_MIN_EFFECTIVE && s->rebuilds >= GKDI_MIN_REBUILDS)) {
         stats->closed++;
         s->verdict = GKD_GATE_CLOSED;
@@ -5621,8 +5637,8 @@ static bool gkdi_model_valid(const uint32_t *packed, uint32_t words)
     if (count > GKD_MAX_LOBES || gkdi_model_words(count) > words)
         return false;
     gkdi_model_unpack(&m, packed);
-    ok = m.held >= 0 && m.held < INFINITY && m.level >= 0 && m.level < INFINITY && gkdi_finite(m.pivot[0]) &&
-         gkdi_finite(m.pivot[1]) && gkdi_finite(m.pivot[2]);
+    ok = m.held >= 0 && m.held < INFINITY && m.level >= 0 && m.level < INFINITY && m.samples >= 0 &&
+         m.samples < INFINITY && gkdi_finite(m.pivot[0]) && gkdi_finite(m.pivot[1]) && gkdi_finite(m.pivot[2]);
     for (k = 0; ok && k < count; ++k) {
         double x = (double)m.sums.x[k], y = (double)m.sums.y[k], z = (double)m.sums.z[k], w = (double)m.sums.soft[k];
         ok = w >= 0 && w < INFINITY && x * x + y * y + z * z <= 1.001 * w * w + 1e-30 && m.sums.nearness[k] >= 0 &&
