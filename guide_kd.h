@@ -2690,7 +2690,8 @@ static inline void gkdi_model_fit(gkdi_model *m, const gkdi_item *items, uint32_
     view.stride = 1;
     memset(&history, 0, sizeof history);
     if (m->count) {
-        history = m->sums;
+        for (uint32_t k = 0; k < m->count; ++k) /* lobes to come have none */
+            gkdi_sums_add(&history, k, &m->sums, k, false);
         gkdi_scale(&history, m->count, (double)o->history * old / level);
         gkdi_maximise(&history, m->count, o, &q);
         if (m->seen < o->seed_seen)
