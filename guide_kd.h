@@ -5519,13 +5519,15 @@ GKD_API gkd_result gkd_save(const gkd_field *field, void *data, size_t capacity,
 typedef struct gkdi_reader {
     const char *at;
     size_t left;
+    bool cut; /* something was not there */
 } gkdi_reader;
 
 /* Copy of the next count * size bytes in memory of its own; NULL where they are not there or memory is out. */
 static void *gkdi_read(gkdi_reader *r, const gkd_desc *desc, uint64_t count, size_t size)
 {
     void *p;
-    if (count > r->left / size)
+    r->cut = r->cut || count > r->left / size;
+    if (r->cut)
         return NULL;
     p = gkdi_allocate(desc, count, size);
     if (p && count)
@@ -5625,19 +5627,21 @@ static bool gkdi_model_valid(const uint32_t *packed, uint32_t words)
 }
 
 /* The sampling part: its own counts and offsets, then every index and number. */
-static bool gkdi_block_valid(gkdi_block *b, uint64_t size, const gkd_desc *desc)
+static gkd_result gkdi_block_valid(gkdi_block *b, uint64_t size, const gkd_desc *desc)
 {
     gkdi_block shape = *b;
     unsigned char *seen;
     uint32_t i, k, lobes = 0;
     bool ok;
     if (b->cells < 1 || b->cells > GKDI_MAX_CELLS || b->nodes != 2 * b->cells - 1)
-        return false;
+        return GKD_CORRUPT;
     gkdi_block_layout(&shape);
     if (shape.size != size || memcmp(&shape, b, sizeof shape) != 0 || !gkdi_within((double)b->uniform, 1e-4, 1))
-        return false;
+        return GKD_CORRUPT;
     seen = (unsigned char *)gkdi_allocate(desc, b->cells, 1);
-    ok = seen && gkdi_tree_valid(gkdi_block_nodes(b), b->nodes, b->cells, seen);
+    if (!seen)
+        return GKD_OUT_OF_MEMORY;
+    ok = gkdi_tree_valid(gkdi_block_nodes(b), b->nodes, b->cells, seen);
     gkdi_release(desc, seen);
     for (i = 0; ok && i < b->cells; ++i) {
         const gkd_cell *c = &gkdi_block_cells(b)[i];
@@ -5649,7 +5653,7 @@ static bool gkdi_block_valid(gkdi_block *b, uint64_t size, const gkd_desc *desc)
             ok = gkdi_lobe_valid(&gkdi_block_lobes(b)[lobes + k]);
         lobes += ok ? c->count : 0;
     }
-    return ok && lobes == b->lobes;
+    return ok && lobes == b->lobes ? GKD_OK : GKD_CORRUPT;
 }
 
 GKD_API gkd_result gkd_validate(const gkd_field *field)
@@ -5668,7 +5672,7 @@ GKD_API gkd_result gkd_validate(const gkd_field *field)
     }
     for (i = 0; ok && i < field->split_count; ++i)
         ok = field->splits[i].parent < field->cell_count && field->splits[i].child < field->cell_count;
-    return ok && gkdi_block_valid(field->block, field->block->size, &field->desc) ? GKD_OK : GKD_CORRUPT;
+    return ok ? gkdi_block_valid(field->block, field->block->size, &field->desc) : GKD_CORRUPT;
 }
 
 /* The parts of a save after the header; what cannot be read stays NULL. */
@@ -5682,7 +5686,7 @@ static gkd_result gkdi_load_parts(gkd_field *f, const gkdi_header *h, gkdi_reade
     f->cells = (gkdi_cell *)gkdi_allocate(d, h->cells, sizeof *f->cells);
     if (!f->nodes || !saved || !f->cells) {
         gkdi_release(d, saved);
-        return GKD_OUT_OF_MEMORY;
+        return r->cut ? GKD_BAD_FILE : GKD_OUT_OF_MEMORY;
     }
     f->node_count = f->node_capacity = h->nodes;
     f->cell_count = f->cell_capacity = h->cells;
@@ -5699,7 +5703,7 @@ static gkd_result gkdi_load_parts(gkd_field *f, const gkdi_header *h, gkdi_reade
         c->model_capacity = c->model ? saved[i].model_words : 0;
         if (!c->look || (saved[i].model_words && !c->model)) {
             gkdi_release(d, saved);
-            return GKD_BAD_FILE;
+            return r->cut ? GKD_BAD_FILE : GKD_OUT_OF_MEMORY;
         }
     }
     gkdi_release(d, saved);
@@ -5710,7 +5714,7 @@ static gkd_result gkdi_load_parts(gkd_field *f, const gkdi_header *h, gkdi_reade
     if (h->block_size < sizeof(gkdi_block) || h->block_size != r->left)
         return GKD_BAD_FILE;
     f->block = (gkdi_block *)gkdi_read(r, d, h->block_size, 1);
-    return f->splits && f->pending && f->block ? GKD_OK : GKD_OUT_OF_MEMORY;
+    return f->splits && f->pending && f->block ? GKD_OK : r->cut ? GKD_BAD_FILE : GKD_OUT_OF_MEMORY;
 }
 
 GKD_API gkd_result gkd_load(const gkd_desc *desc, const void *data, size_t size, gkd_field **field)
@@ -5755,12 +5759,14 @@ GKD_API gkd_result gkd_load(const gkd_desc *desc, const void *data, size_t size,
     f->pixels = h.pixels != 0;
     r.at = (const char *)data + sizeof h;
     r.left = size - sizeof h;
+    r.cut = false;
     gkdi_field_options(f);
     result = gkdi_load_parts(f, &h, &r);
-    if (!result && gkdi_block_valid(f->block, f->block->size, &d) && f->block->size == h.block_size)
-        result = gkd_validate(f) == GKD_OK ? GKD_OK : GKD_BAD_FILE;
-    else if (!result)
-        result = GKD_BAD_FILE;
+    if (!result)
+        result = gkdi_block_valid(f->block, h.block_size, &d);
+    if (!result)
+        result = gkd_validate(f);
+    result = result == GKD_CORRUPT ? GKD_BAD_FILE : result;
     if (result) {
         gkd_destroy(f);
         return result;
