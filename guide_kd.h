@@ -3025,6 +3025,7 @@ typedef struct gkdi_outcome {
     uint32_t *range; /* [count + 1][2]: items, then zeros of each cell, as begin and end */
     uint64_t radiance_splits, direction_splits, denied, fits;
     bool failed; /* no memory for its samples */
+    bool grows;  /* its lookahead tree may take more memory */
 } gkdi_outcome;
 
 typedef struct gkdi_update {
@@ -3461,7 +3462,9 @@ static bool gkdi_split_cell(const gkd_field *field, gkdi_outcome *o, gkdi_cell_s
     for (i = 0; i < o->count; ++i) {
         gkdi_cell *c = &o->cells[i];
         if (!gkdi_fit_cell(field, o, c, batch->items + o->range[4 * i], o->range[4 * i + 1] - o->range[4 * i]) ||
-            !gkdi_look_resize(desc, c, gkdi_look_room(desc, c->look_count)))
+            !gkdi_look_resize(desc, c,
+                              o->count > 1 ? gkdi_look_room(desc, c->look_count) /* undivided: as it was */
+                                           : field->cells[o->cell].look_capacity))
             return false;
     }
     return true;
@@ -3476,7 +3479,7 @@ static void gkdi_update_cell(const gkdi_update *u, gkdi_outcome *o, gkdi_cell_sa
     gkdi_cell *c = &field->cells[o->cell];
     uint32_t range[4], room = gkdi_look_room(desc, c->look_count);
     gkdi_take_samples(u, o, c, batch, range);
-    if (room > c->look_capacity)
+    if (room > c->look_capacity && o->grows)
         gkdi_look_resize(desc, c, room); /* else it grows later */
     gkdi_feed(desc, c, batch, range);
     if (gkdi_wants_split(field, c)) {
@@ -3664,12 +3667,12 @@ static void gkdi_tell_splits(gkd_field *field, const gkdi_outcome *o, uint32_t f
 }
 
 /* New cells that memory allows. */
-static uint64_t gkdi_cells_allowed(const gkd_field *field)
+static uint64_t gkdi_cells_allowed(const gkd_field *field, uint64_t bytes)
 {
     const gkd_desc *desc = &field->desc;
     uint64_t one = 2 * sizeof(gkdi_cell) + sizeof(gkd_cell) + 2 * sizeof(gkd_node) + sizeof(gkdi_model) +
                    desc->max_lobes * sizeof(gkd_lobe) + ((2u << gkdi_look_levels(desc)) - 1) * sizeof(gkd_signature);
-    uint64_t left = field->stats.bytes < desc->max_bytes ? desc->max_bytes - field->stats.bytes : 0, n = left / one;
+    uint64_t left = bytes < desc->max_bytes ? desc->max_bytes - bytes : 0, n = left / one;
     uint64_t most = GKDI_MAX_CELLS - field->cell_count;
     return n < most ? n : most;
 }
@@ -3738,13 +3741,20 @@ static gkd_result gkdi_do_update(gkd_field *field, gkd_parallel_fn parallel, voi
     const gkd_desc *desc = &field->desc;
     gkdi_update u;
     uint32_t *start = NULL, i, k;
-    uint64_t allowed = gkdi_cells_allowed(field), lost = field->stats.lost;
+    uint64_t allowed, lost = field->stats.lost, bytes = field->stats.bytes;
     bool ok;
     memset(&u, 0, sizeof u);
     ok = gkdi_update_start(&u, field, &start);
     if (ok) {
         gkdi_run(parallel, user, u.count, 4096, gkdi_locate, &u);
         gkdi_sort(&u, start);
+        for (k = 0; k < u.outcome_count; ++k) { /* lookahead trees grow while memory allows */
+            const gkdi_cell *c = &field->cells[u.outcomes[k].cell];
+            uint32_t n = gkdi_look_room(desc, c->look_count), more = n > c->look_capacity ? n - c->look_capacity : 0;
+            u.outcomes[k].grows = bytes + more * sizeof *c->look <= desc->max_bytes;
+            bytes += u.outcomes[k].grows ? more * sizeof *c->look : 0;
+        }
+        allowed = gkdi_cells_allowed(field, bytes);
         for (k = 0; k < u.outcome_count; ++k) { /* each cell's share of them */
             double share = (double)(u.outcomes[k].end - u.outcomes[k].first) / (double)u.count;
             u.outcomes[k].room = (uint32_t)fmin((double)allowed * share, 1e6);
