@@ -1018,9 +1018,9 @@ GKD_API void gkd_pdf_directions(const gkd_view *view, const gkd_handle *handle, 
 #define GKDI_MAX_ROOT 1e15     /* contributions are clamped to this before squaring */
 #define GKDI_CONFIDENCE 1.645  /* one-sided 95 % of the normal distribution */
 #define GKDI_MIN_EFFECTIVE                                                                                             \
-    128.0                         /* effective non-zero samples for the verdict "this mixture does not pay"; fewer     \
-                                     closes cells whose light is rarely found */
-#define GKDI_MIN_EVEN 32.0        /* for "too even to pay" */
+    128.0                  /* effective non-zero samples for the verdict "this mixture does not pay"; fewer            \
+                              closes cells whose light is rarely found */
+#define GKDI_MIN_EVEN 32.0 /* for "too even to pay" */
 #define GKDI_MIN_EVEN_REBUILDS                                                                                         \
     8 /* and before that verdict: the first cells are large, and have not yet found light that is rare; without it all \
          of pool closes at once */
@@ -2706,7 +2706,8 @@ static inline void gkdi_model_fit(gkdi_model *m, const gkdi_item *items, uint32_
     view.stride = 1;
     memset(&history, 0, sizeof history);
     if (m->count) {
-        history = m->sums;
+        for (uint32_t k = 0; k < m->count; ++k) /* lobes to come have none */
+            gkdi_sums_add(&history, k, &m->sums, k, false);
         gkdi_scale(&history, m->count, held > 0 ? (1 - mass) * total / (double)m->held : 0);
         gkdi_maximise(&history, m->count, o, &q);
         if (m->seen < o->seed_seen)
@@ -3046,6 +3047,7 @@ typedef struct gkdi_outcome {
     uint32_t *range; /* [count + 1][2]: items, then zeros of each cell, as begin and end */
     uint64_t radiance_splits, direction_splits, denied, fits;
     bool failed; /* no memory for its samples */
+    bool grows;  /* its lookahead tree may take more memory */
 } gkdi_outcome;
 
 typedef struct gkdi_update {
@@ -3483,7 +3485,9 @@ static bool gkdi_split_cell(const gkd_field *field, gkdi_outcome *o, gkdi_cell_s
     for (i = 0; i < o->count; ++i) {
         gkdi_cell *c = &o->cells[i];
         if (!gkdi_fit_cell(field, o, c, batch->items + o->range[4 * i], o->range[4 * i + 1] - o->range[4 * i]) ||
-            !gkdi_look_resize(desc, c, gkdi_look_room(desc, c->look_count)))
+            !gkdi_look_resize(desc, c,
+                              o->count > 1 ? gkdi_look_room(desc, c->look_count) /* undivided: as it was */
+                                           : field->cells[o->cell].look_capacity))
             return false;
     }
     return true;
@@ -3498,7 +3502,7 @@ static void gkdi_update_cell(const gkdi_update *u, gkdi_outcome *o, gkdi_cell_sa
     gkdi_cell *c = &field->cells[o->cell];
     uint32_t range[4], room = gkdi_look_room(desc, c->look_count);
     gkdi_take_samples(u, o, c, batch, range);
-    if (room > c->look_capacity)
+    if (room > c->look_capacity && o->grows)
         gkdi_look_resize(desc, c, room); /* else it grows later */
     gkdi_feed(desc, c, batch, range);
     if (gkdi_wants_split(field, c)) {
@@ -3687,12 +3691,12 @@ static void gkdi_tell_splits(gkd_field *field, const gkdi_outcome *o, uint32_t f
 }
 
 /* New cells that memory allows. */
-static uint64_t gkdi_cells_allowed(const gkd_field *field)
+static uint64_t gkdi_cells_allowed(const gkd_field *field, uint64_t bytes)
 {
     const gkd_desc *desc = &field->desc;
     uint64_t one = 2 * sizeof(gkdi_cell) + sizeof(gkd_cell) + 2 * sizeof(gkd_node) + sizeof(gkdi_model) +
                    desc->max_lobes * sizeof(gkd_lobe) + ((2u << gkdi_look_levels(desc)) - 1) * sizeof(gkd_signature);
-    uint64_t left = field->stats.bytes < desc->max_bytes ? desc->max_bytes - field->stats.bytes : 0, n = left / one;
+    uint64_t left = bytes < desc->max_bytes ? desc->max_bytes - bytes : 0, n = left / one;
     uint64_t most = GKDI_MAX_CELLS - field->cell_count;
     return n < most ? n : most;
 }
@@ -3761,13 +3765,20 @@ static gkd_result gkdi_do_update(gkd_field *field, gkd_parallel_fn parallel, voi
     const gkd_desc *desc = &field->desc;
     gkdi_update u;
     uint32_t *start = NULL, i, k;
-    uint64_t allowed = gkdi_cells_allowed(field), lost = field->stats.lost;
+    uint64_t allowed, lost = field->stats.lost, bytes = field->stats.bytes;
     bool ok;
     memset(&u, 0, sizeof u);
     ok = gkdi_update_start(&u, field, &start);
     if (ok) {
         gkdi_run(parallel, user, u.count, 4096, gkdi_locate, &u);
         gkdi_sort(&u, start);
+        for (k = 0; k < u.outcome_count; ++k) { /* lookahead trees grow while memory allows */
+            const gkdi_cell *c = &field->cells[u.outcomes[k].cell];
+            uint32_t n = gkdi_look_room(desc, c->look_count), more = n > c->look_capacity ? n - c->look_capacity : 0;
+            u.outcomes[k].grows = bytes + more * sizeof *c->look <= desc->max_bytes;
+            bytes += u.outcomes[k].grows ? more * sizeof *c->look : 0;
+        }
+        allowed = gkdi_cells_allowed(field, bytes);
         for (k = 0; k < u.outcome_count; ++k) { /* each cell's share of them */
             double share = (double)(u.outcomes[k].end - u.outcomes[k].first) / (double)u.count;
             u.outcomes[k].room = (uint32_t)fmin((double)allowed * share, 1e6);
@@ -5542,13 +5553,15 @@ GKD_API gkd_result gkd_save(const gkd_field *field, void *data, size_t capacity,
 typedef struct gkdi_reader {
     const char *at;
     size_t left;
+    bool cut; /* something was not there */
 } gkdi_reader;
 
 /* Copy of the next count * size bytes in memory of its own; NULL where they are not there or memory is out. */
 static void *gkdi_read(gkdi_reader *r, const gkd_desc *desc, uint64_t count, size_t size)
 {
     void *p;
-    if (count > r->left / size)
+    r->cut = r->cut || count > r->left / size;
+    if (r->cut)
         return NULL;
     p = gkdi_allocate(desc, count, size);
     if (p && count)
@@ -5648,19 +5661,21 @@ static bool gkdi_model_valid(const uint32_t *packed, uint32_t words)
 }
 
 /* The sampling part: its own counts and offsets, then every index and number. */
-static bool gkdi_block_valid(gkdi_block *b, uint64_t size, const gkd_desc *desc)
+static gkd_result gkdi_block_valid(gkdi_block *b, uint64_t size, const gkd_desc *desc)
 {
     gkdi_block shape = *b;
     unsigned char *seen;
     uint32_t i, k, lobes = 0;
     bool ok;
     if (b->cells < 1 || b->cells > GKDI_MAX_CELLS || b->nodes != 2 * b->cells - 1)
-        return false;
+        return GKD_CORRUPT;
     gkdi_block_layout(&shape);
     if (shape.size != size || memcmp(&shape, b, sizeof shape) != 0 || !gkdi_within((double)b->uniform, 1e-4, 1))
-        return false;
+        return GKD_CORRUPT;
     seen = (unsigned char *)gkdi_allocate(desc, b->cells, 1);
-    ok = seen && gkdi_tree_valid(gkdi_block_nodes(b), b->nodes, b->cells, seen);
+    if (!seen)
+        return GKD_OUT_OF_MEMORY;
+    ok = gkdi_tree_valid(gkdi_block_nodes(b), b->nodes, b->cells, seen);
     gkdi_release(desc, seen);
     for (i = 0; ok && i < b->cells; ++i) {
         const gkd_cell *c = &gkdi_block_cells(b)[i];
@@ -5672,7 +5687,7 @@ static bool gkdi_block_valid(gkdi_block *b, uint64_t size, const gkd_desc *desc)
             ok = gkdi_lobe_valid(&gkdi_block_lobes(b)[lobes + k]);
         lobes += ok ? c->count : 0;
     }
-    return ok && lobes == b->lobes;
+    return ok && lobes == b->lobes ? GKD_OK : GKD_CORRUPT;
 }
 
 GKD_API gkd_result gkd_validate(const gkd_field *field)
@@ -5691,7 +5706,7 @@ GKD_API gkd_result gkd_validate(const gkd_field *field)
     }
     for (i = 0; ok && i < field->split_count; ++i)
         ok = field->splits[i].parent < field->cell_count && field->splits[i].child < field->cell_count;
-    return ok && gkdi_block_valid(field->block, field->block->size, &field->desc) ? GKD_OK : GKD_CORRUPT;
+    return ok ? gkdi_block_valid(field->block, field->block->size, &field->desc) : GKD_CORRUPT;
 }
 
 /* The parts of a save after the header; what cannot be read stays NULL. */
@@ -5705,7 +5720,7 @@ static gkd_result gkdi_load_parts(gkd_field *f, const gkdi_header *h, gkdi_reade
     f->cells = (gkdi_cell *)gkdi_allocate(d, h->cells, sizeof *f->cells);
     if (!f->nodes || !saved || !f->cells) {
         gkdi_release(d, saved);
-        return GKD_OUT_OF_MEMORY;
+        return r->cut ? GKD_BAD_FILE : GKD_OUT_OF_MEMORY;
     }
     f->node_count = f->node_capacity = h->nodes;
     f->cell_count = f->cell_capacity = h->cells;
@@ -5722,7 +5737,7 @@ static gkd_result gkdi_load_parts(gkd_field *f, const gkdi_header *h, gkdi_reade
         c->model_capacity = c->model ? saved[i].model_words : 0;
         if (!c->look || (saved[i].model_words && !c->model)) {
             gkdi_release(d, saved);
-            return GKD_BAD_FILE;
+            return r->cut ? GKD_BAD_FILE : GKD_OUT_OF_MEMORY;
         }
     }
     gkdi_release(d, saved);
@@ -5733,7 +5748,7 @@ static gkd_result gkdi_load_parts(gkd_field *f, const gkdi_header *h, gkdi_reade
     if (h->block_size < sizeof(gkdi_block) || h->block_size != r->left)
         return GKD_BAD_FILE;
     f->block = (gkdi_block *)gkdi_read(r, d, h->block_size, 1);
-    return f->splits && f->pending && f->block ? GKD_OK : GKD_OUT_OF_MEMORY;
+    return f->splits && f->pending && f->block ? GKD_OK : r->cut ? GKD_BAD_FILE : GKD_OUT_OF_MEMORY;
 }
 
 GKD_API gkd_result gkd_load(const gkd_desc *desc, const void *data, size_t size, gkd_field **field)
@@ -5778,12 +5793,14 @@ GKD_API gkd_result gkd_load(const gkd_desc *desc, const void *data, size_t size,
     f->pixels = h.pixels != 0;
     r.at = (const char *)data + sizeof h;
     r.left = size - sizeof h;
+    r.cut = false;
     gkdi_field_options(f);
     result = gkdi_load_parts(f, &h, &r);
-    if (!result && gkdi_block_valid(f->block, f->block->size, &d) && f->block->size == h.block_size)
-        result = gkd_validate(f) == GKD_OK ? GKD_OK : GKD_BAD_FILE;
-    else if (!result)
-        result = GKD_BAD_FILE;
+    if (!result)
+        result = gkdi_block_valid(f->block, h.block_size, &d);
+    if (!result)
+        result = gkd_validate(f);
+    result = result == GKD_CORRUPT ? GKD_BAD_FILE : result;
     if (result) {
         gkd_destroy(f);
         return result;
