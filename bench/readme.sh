@@ -36,10 +36,10 @@ for json in "$@"; do
             } else if (value($0, "target_ns") + 0 > 0) {
                 ns = value($0, "ns")
                 goal = value($0, "target_ns")
-                digits = ns < 20 ? 1 : 0
+                digits = ns + 0 < 20 ? 1 : 0
                 rows = rows sprintf("| %s | %.*f | %.*f | %.0f %% | %s | %.2fx | %s%s |\n", value($0, "name"), digits, ns,
                     digits, value($0, "median_ns"), 100 * value($0, "spread"),
-                    value($0, "naive_ns") > 0 ? sprintf("%.1fx", value($0, "naive_ns") / ns) : "-",
+                    value($0, "naive_ns") + 0 > 0 ? sprintf("%.1fx", value($0, "naive_ns") / ns) : "-",
                     ns / value($0, "limit_ns"), goal + 0, ns + 0 <= goal + 0 ? "" : ", missed")
             }
             next
