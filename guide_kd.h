@@ -3044,7 +3044,7 @@ typedef struct gkdi_outcome {
     uint32_t count, capacity, node_count, node_capacity;
     gkdi_cell *cells;
     gkd_node *nodes; /* links of leaves: local cells; 0 is the root */
-    uint32_t *range; /* [count + 1][2]: items, then zeros of each cell, as begin and end */
+    uint32_t *range; /* [capacity][4]: begin and end of a cell's items, then of its zeros */
     uint64_t radiance_splits, direction_splits, denied, fits;
     bool failed; /* no memory for its samples */
     bool grows;  /* its lookahead tree may take more memory */
@@ -3382,6 +3382,16 @@ static float gkdi_sample_pdf(const gkd_view *view, const gkd_training_sample *s,
     return gkd_pdf(&handle, direction);
 }
 
+/* A sample's position, within the bounds. */
+static void gkdi_place(const gkd_desc *desc, const gkd_training_sample *s, float position[3])
+{
+    uint32_t k;
+    for (k = 0; k < 3; ++k) {
+        float x = s->position[k] > desc->bounds_min[k] ? s->position[k] : desc->bounds_min[k];
+        position[k] = x < desc->bounds_max[k] ? x : desc->bounds_max[k];
+    }
+}
+
 /* Decode a cell's samples and tell its gate of them; range is set to what there is. */
 static void gkdi_take_samples(const gkdi_update *u, const gkdi_outcome *o, gkdi_cell *c, gkdi_cell_samples *batch,
                               uint32_t range[4])
@@ -3389,16 +3399,13 @@ static void gkdi_take_samples(const gkdi_update *u, const gkdi_outcome *o, gkdi_
     const gkd_desc *desc = &u->field->desc;
     gkd_view view = gkd_get_view(u->field);
     bool judge = !desc->no_gate && !desc->no_mixtures && (c->gate.verdict != GKD_GATE_CLOSED || c->gate.probe == 0);
-    uint32_t i, k, items = 0, zeros = 0;
+    uint32_t i, items = 0, zeros = 0;
     for (i = o->first; i < o->end; ++i) {
         const gkd_training_sample *s = &u->samples[u->order[i]];
         bool rejected = s->radiance == 0 && signbit(s->radiance);
         double p = (double)s->pdf_mix, pg = (double)s->pdf_guide, g = rejected ? 0 : (double)s->contribution;
         float direction[3], position[3];
-        for (k = 0; k < 3; ++k) {
-            float x = s->position[k] > desc->bounds_min[k] ? s->position[k] : desc->bounds_min[k];
-            position[k] = x < desc->bounds_max[k] ? x : desc->bounds_max[k];
-        }
+        gkdi_place(desc, s, position);
         gkd_unpack_direction(s->direction, direction);
         c->gate.fresh += 1;
         c->gate.flow += g / p < 1e30 ? g / p : 1e30;
@@ -3548,30 +3555,21 @@ static bool gkdi_sample_valid(const gkd_training_sample *s)
            s->pdf_guide < INFINITY && s->nearness >= 0 && s->nearness < INFINITY;
 }
 
-static uint32_t gkdi_leaf(const gkd_node *nodes, const float position[3])
-{
-    uint32_t node = 0;
-    while (!(nodes[node].link & GKD_LEAF))
-        node = (nodes[node].link & 0x1fffffffu) + !(position[nodes[node].link >> 29] < nodes[node].split);
-    return node;
-}
-
 static void gkdi_locate(void *context, uint32_t begin, uint32_t end)
 {
     gkdi_update *u = (gkdi_update *)context;
-    const gkd_desc *desc = &u->field->desc;
-    uint32_t i, k;
+    gkd_view building;
+    uint32_t i;
+    memset(&building, 0, sizeof building);
+    building.nodes = u->field->nodes; /* all that finding a cell reads */
     for (i = begin; i < end; ++i) {
         const gkd_training_sample *s = &u->samples[i];
         float p[3];
         u->cell_of[i] = GKDI_NONE;
         if (!gkdi_sample_valid(s))
             continue;
-        for (k = 0; k < 3; ++k) {
-            float x = s->position[k] > desc->bounds_min[k] ? s->position[k] : desc->bounds_min[k];
-            p[k] = x < desc->bounds_max[k] ? x : desc->bounds_max[k];
-        }
-        u->cell_of[i] = u->field->nodes[gkdi_leaf(u->field->nodes, p)].link & ~GKD_LEAF;
+        gkdi_place(&u->field->desc, s, p);
+        u->cell_of[i] = gkd_find_cell(&building, p);
     }
 }
 

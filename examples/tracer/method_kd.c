@@ -120,12 +120,10 @@ static bool kd_begin_pass(void *method, const tr_pass *pass)
     return !pass->last;
 }
 
-/* Whether a tile's paths are worth recording: every 1 / fraction-th, starting elsewhere in every pass. */
 static bool kd_wants_records(void *method, int tile)
 {
     const kd *m = method;
-    double start = m->pass * 0.6180339887 + tile * (double)m->fraction;
-    return floor(start + (double)m->fraction) > floor(start);
+    return tile_records(m->pass, m->fraction, tile);
 }
 
 static gkd_training_sample convert(const kd *m, const tr_vertex *v)

@@ -1,4 +1,4 @@
-/* method_options.h: what guiding methods share in reading their --set key=value. */
+/* method_options.h: what guiding methods share: reading their --set key=value, and which tiles record. */
 #ifndef TR_METHOD_OPTIONS_H
 #define TR_METHOD_OPTIONS_H
 
@@ -58,6 +58,13 @@ static double number(parser *p, const char *key, double fallback)
     if (end == value || *end || !(x >= 0))
         complain(p, key, value, "a number >= 0");
     return x;
+}
+
+/* Whether a tile's paths are worth recording: every 1 / fraction-th, starting elsewhere in every pass. */
+static bool tile_records(int pass, float fraction, int tile)
+{
+    double start = pass * 0.6180339887 + tile * (double)fraction;
+    return floor(start + (double)fraction) > floor(start);
 }
 
 #endif

@@ -131,12 +131,10 @@ static bool sdtree_begin_pass(void *method, const tr_pass *pass)
     return !pass->last;
 }
 
-/* Whether a tile's paths are worth recording: every 1 / fraction-th, starting elsewhere in every pass. */
 static bool sdtree_wants_records(void *method, int tile)
 {
     const sdtree *m = method;
-    double start = m->pass * 0.6180339887 + tile * (double)m->fraction;
-    return floor(start + (double)m->fraction) > floor(start);
+    return tile_records(m->pass, m->fraction, tile);
 }
 
 static gsd_training_sample convert(const sdtree *m, const tr_vertex *v)
