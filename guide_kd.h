@@ -1625,13 +1625,14 @@ static int gkdi_compare(const gkdi_split_tests *t, const gkd_signature *cell, co
 #define GKDI_PAIR 0.05  /* squared distance of samples that may show the same light: 13 degrees */
 #define GKDI_TOP 32     /* largest weights known singly */
 #define GKDI_MIN_TEST 8 /* effective samples that a lobe needs to be split */
-#define GKDI_TESTS 6    /* soft^2, then five moments beyond those of a lobe */
+#define GKDI_TESTS 5    /* moments beyond those of a lobe */
 
 enum { GKDI_BASE, GKDI_AVX2, GKDI_PLAIN }; /* plain: without vector types */
 
 /* Sums of a mixture, in effective samples. Lobes are columns. */
 typedef struct gkdi_sums {
     float soft[GKD_MAX_LOBES];                                  /* sum of v = weight * responsibility */
+    float squares[GKD_MAX_LOBES];                               /* sum of v^2 */
     float x[GKD_MAX_LOBES], y[GKD_MAX_LOBES], z[GKD_MAX_LOBES]; /* sum of v * direction from the pivot */
     float nearness[GKD_MAX_LOBES];                              /* sum of v * nearness from the pivot */
 } gkdi_sums;
@@ -1642,7 +1643,7 @@ typedef struct gkdi_model {
     float held;     /* effective samples in the sums; sum of soft */
     float level;    /* mean weight of the samples that they stand for */
     float samples;  /* whose number that is */
-    uint32_t seen;  /* samples in all, whatever their weight, decayed or not; saturates */
+    uint32_t seen;  /* samples in all, whatever their weight, faded or not; saturates; a split halves it */
     gkdi_sums sums;
 } gkdi_model;
 
@@ -1655,7 +1656,7 @@ typedef struct gkdi_fit_options {
     uint32_t first_passes; /* over a subset, for a new model; 10 is worse by 2 % where samples are few */
     uint32_t passes;       /* over all samples; 1: no splits */
     uint32_t subset;       /* samples of first passes */
-    float history;         /* factor for sums held before the batch */
+    float history;         /* of all samples seen so many count: those held before a batch fade to it */
     float weight_prior;    /* samples added to each lobe's weight */
     float kappa_prior;     /* samples added to each lobe's concentration, ... */
     float kappa_spread;    /* with that 1 - mean cosine: 0.03 for many samples, 0.1 for few */
@@ -1682,9 +1683,9 @@ static inline gkdi_fit_options gkdi_fit_defaults(void)
     o.first_passes = 3;
     o.passes = 2;
     o.subset = 1024;
-    o.history = 1;
+    o.history = 0.25f;
     o.weight_prior = 0.05f;
-    o.kappa_prior = 0.3f;
+    o.kappa_prior = 0.1f;
     o.kappa_spread = 0.06f;
     o.broad_kappa = 1;
     o.broad_prior = 1;
@@ -1693,8 +1694,8 @@ static inline gkdi_fit_options gkdi_fit_defaults(void)
     o.split_lobe = 0.1f;
     o.split_sigma = 4;
     o.split_price = 4;
-    o.merge = 0.006f;
-    o.share = 2;
+    o.merge = 0.002f;
+    o.share = 20;
     o.parallax = 4;
     o.jacobian = true;
     return o;
@@ -1711,7 +1712,8 @@ typedef struct gkdi_mixture {
 
 /* Of one pass. */
 typedef struct gkdi_batch {
-    double soft[GKD_MAX_LOBES], x[GKD_MAX_LOBES], y[GKD_MAX_LOBES], z[GKD_MAX_LOBES], nearness[GKD_MAX_LOBES];
+    double soft[GKD_MAX_LOBES], squares[GKD_MAX_LOBES], x[GKD_MAX_LOBES], y[GKD_MAX_LOBES], z[GKD_MAX_LOBES],
+        nearness[GKD_MAX_LOBES];
     double test[GKD_MAX_LOBES][GKDI_TESTS];
     double likelihood, weight;
 } gkdi_batch;
@@ -1884,7 +1886,7 @@ GKDI_INLINE void gkdi_collect(const gkdi_mixture *q, const gkdi_chunk *c, gkdi_v
 {
     for (uint32_t k = 0; k < q->count; ++k) {
         float mx = q->x[k], my = q->y[k], mz = q->z[k];
-        gkdi_v8 a[5] = {{0}, {0}, {0}, {0}, {0}};
+        gkdi_v8 a[6] = {{0}, {0}, {0}, {0}, {0}, {0}};
         for (uint32_t g = 0; g < c->groups; ++g) {
             gkdi_v8 r = density[k][g] * share[g];
             a[0] += r;
@@ -1892,6 +1894,7 @@ GKDI_INLINE void gkdi_collect(const gkdi_mixture *q, const gkdi_chunk *c, gkdi_v
             a[2] += r * (c->y[g] - my);
             a[3] += r * (c->z[g] - mz);
             a[4] += r * c->nearness[g];
+            a[5] += r * r;
         }
         double soft = (double)gkdi_add_lanes(&a[0]);
         out->soft[k] += soft;
@@ -1899,6 +1902,7 @@ GKDI_INLINE void gkdi_collect(const gkdi_mixture *q, const gkdi_chunk *c, gkdi_v
         out->y[k] += (double)gkdi_add_lanes(&a[2]) + soft * (double)my;
         out->z[k] += (double)gkdi_add_lanes(&a[3]) + soft * (double)mz;
         out->nearness[k] += (double)gkdi_add_lanes(&a[4]);
+        out->squares[k] += (double)gkdi_add_lanes(&a[5]);
     }
 }
 
@@ -1909,17 +1913,16 @@ GKDI_INLINE void gkdi_collect_tests(const gkdi_mixture *q, const gkdi_chunk *c, 
     for (uint32_t k = 0; k < q->count; ++k) {
         float mx = q->x[k], my = q->y[k], mz = q->z[k], h = q->kappa[k] * 0.5f;
         const float *s = q->s[k], *t = q->t[k];
-        gkdi_v8 sum[GKDI_TESTS] = {{0}, {0}, {0}, {0}, {0}, {0}};
+        gkdi_v8 sum[GKDI_TESTS] = {{0}, {0}, {0}, {0}, {0}};
         for (uint32_t g = 0; g < c->groups; ++g) {
             gkdi_v8 r = density[k][g] * share[g], x = c->x[g] - mx, y = c->y[g] - my, z = c->z[g] - mz;
             gkdi_v8 a = x * s[0] + y * s[1] + z * s[2], b = x * t[0] + y * t[1] + z * t[2];
             gkdi_v8 u = h * (x * x + y * y + z * z), ru = r * u;
-            sum[0] += r * r;
-            sum[1] += r * (a * a - b * b);
-            sum[2] += r * (a * b);
-            sum[3] += ru * u;
-            sum[4] += ru * a;
-            sum[5] += ru * b;
+            sum[0] += r * (a * a - b * b);
+            sum[1] += r * (a * b);
+            sum[2] += ru * u;
+            sum[3] += ru * a;
+            sum[4] += ru * b;
         }
         for (int j = 0; j < GKDI_TESTS; ++j)
             out->test[k][j] += (double)gkdi_add_lanes(&sum[j]);
@@ -2026,9 +2029,9 @@ static inline float gkdi_plain_density(const gkdi_mixture *q, uint32_t k, const 
 static inline void gkdi_plain_collect(const gkdi_mixture *q, uint32_t k, const gkdi_plain_chunk *c, bool tests,
                                       gkdi_batch *out)
 {
-    float a[5 + GKDI_TESTS][8], mx = q->x[k], my = q->y[k], mz = q->z[k], h = q->kappa[k] * 0.5f;
+    float a[6 + GKDI_TESTS][8], mx = q->x[k], my = q->y[k], mz = q->z[k], h = q->kappa[k] * 0.5f;
     const float *s = q->s[k], *t = q->t[k];
-    double sum[5 + GKDI_TESTS];
+    double sum[6 + GKDI_TESTS];
     memset(a, 0, sizeof a);
     for (uint32_t i = 0; i < c->count; ++i) {
         uint32_t j = i & 7;
@@ -2038,26 +2041,27 @@ static inline void gkdi_plain_collect(const gkdi_mixture *q, uint32_t k, const g
         a[2][j] += r * y;
         a[3][j] += r * z;
         a[4][j] += r * c->nearness[i];
+        a[5][j] += r * r;
         if (!tests)
             continue;
         float ta = x * s[0] + y * s[1] + z * s[2], tb = x * t[0] + y * t[1] + z * t[2];
         float u = h * (x * x + y * y + z * z), ru = r * u;
-        a[5][j] += r * r;
         a[6][j] += r * (ta * ta - tb * tb);
         a[7][j] += r * (ta * tb);
         a[8][j] += ru * u;
         a[9][j] += ru * ta;
         a[10][j] += ru * tb;
     }
-    for (int i = 0; i < 5 + GKDI_TESTS; ++i)
+    for (int i = 0; i < 6 + GKDI_TESTS; ++i)
         sum[i] = (double)(((a[i][0] + a[i][4]) + (a[i][2] + a[i][6])) + ((a[i][1] + a[i][5]) + (a[i][3] + a[i][7])));
     out->soft[k] += sum[0];
     out->x[k] += sum[1] + sum[0] * (double)mx;
     out->y[k] += sum[2] + sum[0] * (double)my;
     out->z[k] += sum[3] + sum[0] * (double)mz;
     out->nearness[k] += sum[4];
+    out->squares[k] += sum[5];
     for (int i = 0; tests && i < GKDI_TESTS; ++i)
-        out->test[k][i] += sum[5 + i];
+        out->test[k][i] += sum[6 + i];
 }
 
 static inline void gkdi_pass_plain(const gkdi_mixture *q, const gkdi_item *items, uint32_t n, const gkdi_view *view,
@@ -2117,9 +2121,10 @@ static inline void gkdi_mixture_set(gkdi_mixture *q, uint32_t k, const float *me
     q->log[k] = (float)log2(gkdi_max(weight, 1e-20) * gkdi_peak(kappa));
 }
 
-/* MAP: weights (soft + a) / (sum + a count); 1 - mean cosine = (soft - |direction sum| + b spread) / (soft + b): b
-   samples with the spread of a broad lobe are added (own; [Ruppert 2020] adds a mean cosine of 0, which keeps lobes of
-   fewer than kappa samples from becoming sharp). Lobe 0 stays broad and keeps a share: it answers for what no other
+/* MAP: weights (soft + a) / (sum + a count); 1 - mean cosine = (soft - |direction sum| + own spread) / (soft + own):
+   b of the lobe's own samples, own = b squares / soft, with the spread of a broad lobe are added, so that few samples
+   that are bright do not count for many (own; [Ruppert 2020] adds a mean cosine of 0, which keeps lobes of fewer than
+   kappa samples from becoming sharp). Lobe 0 stays broad and keeps a share: it answers for what no other
    lobe explains (own). */
 static inline void gkdi_maximise(const gkdi_sums *s, uint32_t count, const gkdi_fit_options *o, gkdi_mixture *q)
 {
@@ -2143,7 +2148,8 @@ static inline void gkdi_maximise(const gkdi_sums *s, uint32_t count, const gkdi_
             mean[1] = (float)(y / r);
             mean[2] = (float)(z / r);
         }
-        spread = (gkdi_max(w - r, 0) + b * (double)o->kappa_spread) / (w + b);
+        double own = w > 0 ? b * (double)s->squares[k] / w : b;
+        spread = (gkdi_max(w - r, 0) + own * (double)o->kappa_spread) / (w + own);
         kappa = gkdi_kappa(spread);
         weight = broad ? (w + (double)o->broad_prior) / sum : (w + a) / sum * factor;
         if (broad) {
@@ -2168,9 +2174,9 @@ static inline gkdi_misfit gkdi_test(const gkdi_mixture *q, const gkdi_batch *b, 
     memset(&m, 0, sizeof m);
     double w = b->soft[k], kappa = (double)q->kappa[k], end = 2 * kappa, e = gkdi_decline(kappa), tail, p = 1;
     double u[5] = {1, 0, 0, 0, 0};
-    if (!(w > 1e-12) || !(b->test[k][0] > 0) || q->kappa[k] < 0.25f)
+    if (!(w > 1e-12) || !(b->squares[k] > 0) || q->kappa[k] < 0.25f)
         return m;
-    m.samples = w * w / b->test[k][0];
+    m.samples = w * w / b->squares[k];
     if (m.samples < GKDI_MIN_TEST)
         return m;
     tail = e / (1 - e);
@@ -2187,11 +2193,11 @@ static inline gkdi_misfit gkdi_test(const gkdi_mixture *q, const gkdi_batch *b, 
     mean_b = dx * (double)q->t[k][0] + dy * (double)q->t[k][1] + dz * (double)q->t[k][2];
     mean_u = -(double)q->kappa[k] * (dx * (double)q->x[k] + dy * (double)q->y[k] + dz * (double)q->z[k]);
     flat = u[4] - u[2] * u[2] - slope * slope * var;
-    m.c[0] = b->test[k][1] / w / sqrt(2 * v2);
-    m.c[1] = b->test[k][2] / w / sqrt(v2 / 2);
-    m.c[2] = (b->test[k][3] / w - u[2] - slope * (mean_u - u[1])) / sqrt(gkdi_max(flat, 1e-12));
-    m.c[3] = (b->test[k][4] / w - c * mean_a) / sqrt(gkdi_max(vuu - c * vu, 1e-12));
-    m.c[4] = (b->test[k][5] / w - c * mean_b) / sqrt(gkdi_max(vuu - c * vu, 1e-12));
+    m.c[0] = b->test[k][0] / w / sqrt(2 * v2);
+    m.c[1] = b->test[k][1] / w / sqrt(v2 / 2);
+    m.c[2] = (b->test[k][2] / w - u[2] - slope * (mean_u - u[1])) / sqrt(gkdi_max(flat, 1e-12));
+    m.c[3] = (b->test[k][3] / w - c * mean_a) / sqrt(gkdi_max(vuu - c * vu, 1e-12));
+    m.c[4] = (b->test[k][4] / w - c * mean_b) / sqrt(gkdi_max(vuu - c * vu, 1e-12));
     for (int j = 0; j < 5; ++j)
         m.chi2 += m.c[j] * m.c[j];
     return m;
@@ -2211,10 +2217,12 @@ static inline void gkdi_unit(float *v)
 }
 
 /* Sets lobe k's sums to what `soft` samples of such a lobe would give. */
-static inline void gkdi_sums_set(gkdi_sums *s, uint32_t k, const float *mean, double kappa, float soft, float nearness)
+static inline void gkdi_sums_set(gkdi_sums *s, uint32_t k, const float *mean, double kappa, float soft, float squares,
+                                 float nearness)
 {
     float r = (float)gkdi_mean_cosine(kappa) * soft;
     s->soft[k] = soft;
+    s->squares[k] = squares;
     s->x[k] = r * mean[0];
     s->y[k] = r * mean[1];
     s->z[k] = r * mean[2];
@@ -2256,9 +2264,10 @@ static inline void gkdi_split(const gkdi_mixture *q, const gkdi_misfit *m, uint3
     gkdi_unit(two);
     gkdi_sums *both[2] = {a, b};
     for (int i = 0; i < 2; ++i) {
-        float soft = 0.5f * both[i]->soft[k], nearness = 0.5f * both[i]->nearness[k];
-        gkdi_sums_set(both[i], k, one, first, soft, nearness);
-        gkdi_sums_set(both[i], other, two, second, soft, nearness);
+        float soft = 0.5f * both[i]->soft[k], squares = 0.5f * both[i]->squares[k],
+              nearness = 0.5f * both[i]->nearness[k];
+        gkdi_sums_set(both[i], k, one, first, soft, squares, nearness);
+        gkdi_sums_set(both[i], other, two, second, soft, squares, nearness);
     }
 }
 
@@ -2341,6 +2350,7 @@ static inline double gkdi_merge_cost(const gkdi_mixture *q, uint32_t a, uint32_t
 static inline void gkdi_sums_add(gkdi_sums *s, uint32_t to, const gkdi_sums *b, uint32_t from, bool add)
 {
     s->soft[to] = b->soft[from] + (add ? s->soft[to] : 0);
+    s->squares[to] = b->squares[from] + (add ? s->squares[to] : 0);
     s->x[to] = b->x[from] + (add ? s->x[to] : 0);
     s->y[to] = b->y[from] + (add ? s->y[to] : 0);
     s->z[to] = b->z[from] + (add ? s->z[to] : 0);
@@ -2586,6 +2596,7 @@ static inline void gkdi_add(const gkdi_sums *history, const gkdi_batch *b, uint3
 {
     for (uint32_t k = 0; k < count; ++k) {
         out->soft[k] = (float)((double)history->soft[k] + b->soft[k]);
+        out->squares[k] = (float)((double)history->squares[k] + b->squares[k]);
         out->x[k] = (float)((double)history->x[k] + b->x[k]);
         out->y[k] = (float)((double)history->y[k] + b->y[k]);
         out->z[k] = (float)((double)history->z[k] + b->z[k]);
@@ -2593,10 +2604,12 @@ static inline void gkdi_add(const gkdi_sums *history, const gkdi_batch *b, uint3
     }
 }
 
-static inline void gkdi_scale(gkdi_sums *s, uint32_t count, double f)
+/* Every sample counts f times what it did, which leaves a lobe's own number of samples; of those only `keep` count. */
+static inline void gkdi_scale(gkdi_sums *s, uint32_t count, double f, double keep)
 {
     for (uint32_t k = 0; k < count; ++k) {
         s->soft[k] = (float)((double)s->soft[k] * f);
+        s->squares[k] = (float)((double)s->squares[k] * f * f / keep);
         s->x[k] = (float)((double)s->x[k] * f);
         s->y[k] = (float)((double)s->y[k] * f);
         s->z[k] = (float)((double)s->z[k] * f);
@@ -2687,8 +2700,9 @@ static inline void gkdi_model_fit(gkdi_model *m, const gkdi_item *items, uint32_
     gkdi_weights w = gkdi_weigh(items, n, gkdi_min((double)o->share / sqrt((double)n), 1));
     if (!(w.sum > 0))
         return;
-    double held = m->count ? (double)m->held * (double)o->history : 0, old = (double)m->level, level;
-    double samples = m->count ? (double)m->samples * (double)o->history : 0, total, mass;
+    double keep = gkdi_min((double)o->history * (double)m->seen / gkdi_max((double)m->samples, 1e-30), 1);
+    double held = m->count ? (double)m->held * keep : 0, old = (double)m->level, level;
+    double samples = m->count ? (double)m->samples * keep : 0, total, mass;
     double now = gkdi_max(w.sum / n, 1e-37);
     if (held > 0)
         gkdi_level(held, &old, w.effective, &now);
@@ -2708,7 +2722,7 @@ static inline void gkdi_model_fit(gkdi_model *m, const gkdi_item *items, uint32_
     if (m->count) {
         for (uint32_t k = 0; k < m->count; ++k) /* lobes to come have none */
             gkdi_sums_add(&history, k, &m->sums, k, false);
-        gkdi_scale(&history, m->count, held > 0 ? (1 - mass) * total / (double)m->held : 0);
+        gkdi_scale(&history, m->count, held > 0 ? (1 - mass) * total / (double)m->held : 0, held > 0 ? keep : 1);
         gkdi_maximise(&history, m->count, o, &q);
         if (m->seen < o->seed_seen)
             gkdi_seed(items, n, &view, o, &q);
@@ -2743,9 +2757,10 @@ static inline uint32_t gkdi_model_lobes(const gkdi_model *m, const gkdi_fit_opti
 /* History counts `factor` times as much from now on. */
 static inline void gkdi_model_decay(gkdi_model *m, float factor)
 {
-    gkdi_scale(&m->sums, m->count, (double)factor);
+    gkdi_scale(&m->sums, m->count, (double)factor, (double)factor);
     m->held *= factor;
     m->samples *= factor;
+    m->seen = (uint32_t)((double)m->seen * (double)factor);
 }
 
 /* The same light seen from another pivot: means turn, and a lobe at finite distance becomes sharper and weaker with
@@ -2773,11 +2788,12 @@ static inline void gkdi_model_move(gkdi_model *m, const float pivot[3], const gk
         }
         const float mean[3] = {(float)(v[0] / len), (float)(v[1] / len), (float)(v[2] / len)};
         double kappa = gkdi_min(gkdi_kappa(gkdi_max(w - r, 0) / w) * f, GKDI_MAX_KAPPA);
-        gkdi_sums_set(s, k, mean, kappa, (float)(w / f), (float)(w / f * nearness / len));
+        gkdi_sums_set(s, k, mean, kappa, (float)(w / f), (float)((double)s->squares[k] / (f * f)),
+                      (float)(w / f * nearness / len));
         sum += w / f;
     }
     if (sum > 0)
-        gkdi_scale(s, m->count, (double)m->held / sum);
+        gkdi_scale(s, m->count, (double)m->held / sum, 1);
     memcpy(m->pivot, pivot, sizeof m->pivot);
 }
 
@@ -2798,8 +2814,8 @@ static inline void gkdi_model_merge(gkdi_model *a, const gkdi_model *b, const gk
     level = (double)a->samples * la + (double)c.samples * lb;
     mass = level > 0 ? (double)c.samples * lb / level : 0.5;
     total = 1 / ((1 - mass) * (1 - mass) / gkdi_max(ha, 1e-30) + mass * mass / gkdi_max(hb, 1e-30));
-    gkdi_scale(&a->sums, a->count, (1 - mass) * total / gkdi_max(ha, 1e-30));
-    gkdi_scale(&c.sums, c.count, mass * total / gkdi_max(hb, 1e-30));
+    gkdi_scale(&a->sums, a->count, (1 - mass) * total / gkdi_max(ha, 1e-30), 1);
+    gkdi_scale(&c.sums, c.count, mass * total / gkdi_max(hb, 1e-30), 1);
     a->samples += c.samples;
     level /= gkdi_max((double)a->samples, 1e-30);
     for (uint32_t k = 0; k < c.count; ++k) {
@@ -2822,14 +2838,14 @@ static inline void gkdi_model_merge(gkdi_model *a, const gkdi_model *b, const gk
     gkdi_total(a, level);
 }
 
-/* Packed form: 8 + 5 * count words of 32 bits. Returns the words written. */
-static inline uint32_t gkdi_model_words(uint32_t count) { return 8 + 5 * count; }
+/* Packed form: 8 + 6 * count words of 32 bits. Returns the words written. */
+static inline uint32_t gkdi_model_words(uint32_t count) { return 8 + 6 * count; }
 static inline uint32_t gkdi_model_pack(const gkdi_model *m, void *out)
 {
     unsigned char *p = (unsigned char *)out;
-    const float *from[5] = {m->sums.soft, m->sums.x, m->sums.y, m->sums.z, m->sums.nearness};
+    const float *from[6] = {m->sums.soft, m->sums.squares, m->sums.x, m->sums.y, m->sums.z, m->sums.nearness};
     memcpy(p, m, 32);
-    for (int i = 0; i < 5; ++i)
+    for (int i = 0; i < 6; ++i)
         memcpy(p + 32 + 4 * (size_t)i * m->count, from[i], 4 * (size_t)m->count);
     return gkdi_model_words(m->count);
 }
@@ -2837,10 +2853,10 @@ static inline uint32_t gkdi_model_unpack(gkdi_model *m, const void *in)
 {
     const unsigned char *p = (const unsigned char *)in;
     memcpy(m, p, 32);
-    float *to[5] = {m->sums.soft, m->sums.x, m->sums.y, m->sums.z, m->sums.nearness};
+    float *to[6] = {m->sums.soft, m->sums.squares, m->sums.x, m->sums.y, m->sums.z, m->sums.nearness};
     if (m->count > GKD_MAX_LOBES) /* only from a damaged file */
         m->count = 0;
-    for (int i = 0; i < 5; ++i)
+    for (int i = 0; i < 6; ++i)
         memcpy(to[i], p + 32 + 4 * (size_t)i * m->count, 4 * (size_t)m->count);
     return gkdi_model_words(m->count);
 }
