@@ -74,9 +74,9 @@
      g = contribution, p_a = a pdf_bsdf + (1 - a) pdf_guide, is the second moment with selection probability a; m = mean
      of g / p; W^2 = mean of (pixel_contribution / g)^2, weighted as in V(1), turns squared contributions into squared
      pixels. Guiding pays where V(1) > (1 + gate_margin) V(a) + gate_gain / W^2. Since no guide has V(a) < m^2, a cell
-     with V(1) < m^2 + gate_gain / W^2 closes whatever its mixture, though not before eight refines: light that
-     is rare must have had the time to be found. Verdicts need 95 % confidence; cells without verdict guide. Without a
-   pixel estimate (gkd_pass.pixel_estimate) 1 / W^2 = 16 m^2.
+     with V(1) < m^2 + gate_gain / W^2 closes whatever its mixture, though not before eight refines: light that is rare
+     must have had the time to be found. Verdicts need 95 % confidence; cells without verdict guide. Without a pixel
+     estimate (gkd_pass.pixel_estimate) 1 / W^2 = 16 m^2.
 
      Use with another directional model: desc.no_mixtures keeps the tree and its splits only. gkd_find_cell tells the
      cell; gkd_pass.on_split tells of each split in order, which the other model repeats.
