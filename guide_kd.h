@@ -375,15 +375,15 @@ GKD_API gkd_result gkd_merge(gkd_field *field, const gkd_field *source, gkd_para
 
 /* ---- >>query ------------------------------------------------------------------------------------------------ */
 
-/* Lobes as seen from a position, sixteen a block of 448 bytes, so that lanes are lobes. Lanes past the last lobe have
+/* Lobes as seen from a position, eight a block of 224 bytes, so that lanes are lobes. Lanes past the last lobe have
    scale 0 and upper 1. Density of a lobe at w: scale 2^(-falloff |w - mean|^2), and the same at w mirrored about the
    surface where there is one: |mirrored w - mean|^2 = |w - mean|^2 + 4 (w . normal) (mean . normal). */
 typedef struct gkd_lobe_block {
-    float x[16], y[16], z[16]; /* unit mean; on the normal's side */
-    float falloff[16];         /* kappa / 2 in powers of two: kappa / (2 ln 2) */
-    float lift[16];            /* 4 falloff (mean . normal) >= 0; 0 without a normal */
-    float scale[16];           /* weight kappa / (2 pi (1 - exp(-2 kappa))): density at the mean */
-    float upper[16];           /* sum of the weights up to this one; the last lobe's is 1 */
+    float x[8], y[8], z[8]; /* unit mean; on the normal's side */
+    float falloff[8];       /* kappa / 2 in powers of two: kappa / (2 ln 2) */
+    float lift[8];          /* 4 falloff (mean . normal) >= 0; 0 without a normal */
+    float scale[8];         /* weight kappa / (2 pi (1 - exp(-2 kappa))): density at the mean */
+    float upper[8];         /* sum of the weights up to this one; the last lobe's is 1 */
 } gkd_lobe_block;
 
 typedef struct gkd_handle {
@@ -393,7 +393,7 @@ typedef struct gkd_handle {
     float normal[3];      /* 0 = full sphere. Else directions below are mirrored up: p'(w) = p(w) + p(mirrored w) */
     float uniform;        /* e: share of uniform sphere sampling */
     uint32_t reserved[7]; /* the blocks start at byte 64 */
-    gkd_lobe_block block[GKD_MAX_LOBES / 16]; /* (count + 15) / 16 are set */
+    gkd_lobe_block block[GKD_MAX_LOBES / 8]; /* (count + 7) / 8 are set */
 } gkd_handle;
 
 #define GKD_LN2 0.69314718055994531f
@@ -489,11 +489,11 @@ GKD_QUERY float gkd_dot(const float a[3], const float b[3])
  */
 GKD_QUERY void gkd_turn_lobe(gkd_handle *handle, uint32_t i, const gkd_lobe *lobe, const float offset[3])
 {
-    gkd_lobe_block *b = &handle->block[i / 16];
+    gkd_lobe_block *b = &handle->block[i / 8];
     float x = lobe->mean[0] + offset[0] * lobe->nearness, y = lobe->mean[1] + offset[1] * lobe->nearness;
     float z = lobe->mean[2] + offset[2] * lobe->nearness, l2 = x * x + y * y + z * z, r;
     bool fine = l2 > 1e-6f && l2 < 1e12f;
-    i %= 16;
+    i %= 8;
     r = fine ? 1 / sqrtf(l2) : 1;
     b->x[i] = fine ? x * r : lobe->mean[0];
     b->y[i] = fine ? y * r : lobe->mean[1];
@@ -513,10 +513,10 @@ GKD_QUERY void gkd_turn_lobe(gkd_handle *handle, uint32_t i, const gkd_lobe *lob
    predicted. Own. */
 GKD_QUERY void gkd_weigh_lobe(gkd_handle *handle, uint32_t i, bool product)
 {
-    gkd_lobe_block *b = &handle->block[i / 16];
+    gkd_lobe_block *b = &handle->block[i / 8];
     const float *n = handle->normal;
     float c, c2, k, j, d, m, s, x, a, phi, q, tail, above, e;
-    i %= 16;
+    i %= 8;
     c = b->x[i] * n[0] + b->y[i] * n[1] + b->z[i] * n[2];
     c2 = gkd_least(c * c, 1);
     k = b->falloff[i];
@@ -539,10 +539,10 @@ GKD_QUERY void gkd_weigh_lobe(gkd_handle *handle, uint32_t i, bool product)
    is to be. */
 GKD_QUERY void gkd_tilt_lobe(gkd_handle *handle, uint32_t i)
 {
-    gkd_lobe_block *b = &handle->block[i / 16];
+    gkd_lobe_block *b = &handle->block[i / 8];
     const float *n = handle->normal;
     float k, l2, r, m[3];
-    i %= 16;
+    i %= 8;
     k = b->falloff[i];
     r = b->lift[i];
     m[0] = b->x[i] * k + n[0] * r;
@@ -590,17 +590,17 @@ GKD_QUERY void gkd_finish_lobes(gkd_handle *handle, float sum)
     float l = 1 / sum, upper = 0;
     uint32_t i;
     for (i = 0; i < handle->count; ++i) {
-        gkd_lobe_block *b = &handle->block[i / 16];
-        float k = b->falloff[i % 16], w = b->upper[i % 16] * l;
-        b->scale[i % 16] = w * k / (2 * GKD_PI * gkd_one_minus_exp(2 * k));
-        b->falloff[i % 16] = k * (0.5f * GKD_LOG2E);
-        b->upper[i % 16] = upper += w;
+        gkd_lobe_block *b = &handle->block[i / 8];
+        float k = b->falloff[i % 8], w = b->upper[i % 8] * l;
+        b->scale[i % 8] = w * k / (2 * GKD_PI * gkd_one_minus_exp(2 * k));
+        b->falloff[i % 8] = k * (0.5f * GKD_LOG2E);
+        b->upper[i % 8] = upper += w;
     }
-    handle->block[(i - 1) / 16].upper[(i - 1) % 16] = 1;
-    for (; i % 16; ++i) {
-        gkd_lobe_block *b = &handle->block[i / 16];
-        b->x[i % 16] = b->y[i % 16] = b->falloff[i % 16] = b->lift[i % 16] = b->scale[i % 16] = 0;
-        b->z[i % 16] = b->upper[i % 16] = 1;
+    handle->block[(i - 1) / 8].upper[(i - 1) % 8] = 1;
+    for (; i % 8; ++i) {
+        gkd_lobe_block *b = &handle->block[i / 8];
+        b->x[i % 8] = b->y[i % 8] = b->falloff[i % 8] = b->lift[i % 8] = b->scale[i % 8] = 0;
+        b->z[i % 8] = b->upper[i % 8] = 1;
     }
 }
 
@@ -638,7 +638,7 @@ GKD_QUERY void gkd_orient_lobes_as(gkd_handle *handle, const gkd_lobe *lobes, ui
     for (i = 0; surface && i < count; ++i)
         gkd_tilt_lobe(handle, i);
     for (i = 0; i < count; ++i)
-        sum += handle->block[i / 16].upper[i % 16];
+        sum += handle->block[i / 8].upper[i % 8];
     if (!(sum > GKD_DIM)) {
         gkd_set_plain(handle, product);
         sum = 1;
@@ -666,14 +666,13 @@ GKD_QUERY float gkd_pdf(const gkd_handle *handle, const float direction[3])
     if (surface && !(c > 0))
         return e * (1 / (4 * GKD_PI));
     for (i = 0; i < handle->count; i += 8) {
-        const gkd_lobe_block *b = &handle->block[i / 16];
-        const uint32_t o = i % 16;
+        const gkd_lobe_block *b = &handle->block[i / 8];
         for (k = 0; k < 8; ++k) {
-            float dx = x - b->x[o + k], dy = y - b->y[o + k], dz = z - b->z[o + k];
-            float t = -b->falloff[o + k] * (dx * dx + dy * dy + dz * dz), p = gkd_exp2(t);
+            float dx = x - b->x[k], dy = y - b->y[k], dz = z - b->z[k];
+            float t = -b->falloff[k] * (dx * dx + dy * dy + dz * dz), p = gkd_exp2(t);
             if (surface)
-                p += gkd_exp2(t - b->lift[o + k] * c);
-            sum[k] += b->scale[o + k] * p;
+                p += gkd_exp2(t - b->lift[k] * c);
+            sum[k] += b->scale[k] * p;
         }
     }
     return (1 - e) * (((sum[0] + sum[4]) + (sum[2] + sum[6])) + ((sum[1] + sum[5]) + (sum[3] + sum[7]))) +
@@ -705,9 +704,9 @@ GKD_QUERY void gkd_draw_lobe(const gkd_handle *handle, uint32_t i, float r, floa
     float low, width;
     uint32_t k;
     i = i < handle->count ? i : handle->count - 1;
-    low = i ? handle->block[(i - 1) / 16].upper[(i - 1) % 16] : 0;
-    b = &handle->block[i / 16];
-    k = i % 16;
+    low = i ? handle->block[(i - 1) / 8].upper[(i - 1) % 8] : 0;
+    b = &handle->block[i / 8];
+    k = i % 8;
     width = b->upper[k] - low;
     out->r = (r - low + extra) / (width > 1e-9f ? width : 1e-9f);
     out->mean[0] = b->x[k];
@@ -740,7 +739,7 @@ GKD_QUERY void gkd_choose_lobe(const gkd_handle *handle, const float u[2], gkd_d
     }
     for (i = 0; i < handle->count; i += 8)
         for (k = 0; k < 8; ++k)
-            n += handle->block[i / 16].upper[i % 16 + k] <= r;
+            n += handle->block[i / 8].upper[k] <= r;
     gkd_draw_lobe(handle, n, r, extra / (1 - e), out);
 }
 
@@ -850,7 +849,7 @@ GKD_QUERY void gkd_find(const gkd_view *view, const float position[3], const flo
 /* A handle is large and mostly unset: copy what is set. [any thread] */
 GKD_QUERY void gkd_copy_handle(gkd_handle *to, const gkd_handle *from)
 {
-    memcpy(to, from, offsetof(gkd_handle, block) + (from->count + 15) / 16 * sizeof from->block[0]);
+    memcpy(to, from, offsetof(gkd_handle, block) + (from->count + 7) / 8 * sizeof from->block[0]);
 }
 
 /* Octahedral coordinates of a direction or normal, both in [-1, 1]. [any thread] */
@@ -4313,141 +4312,87 @@ static float *gkdi_row_out(float *base, size_t stride, uint32_t row)
     return (float *)(void *)((char *)base + stride * row);
 }
 
-/* ---- sixteen floats: AVX2 (two halves: that hides latency, too), NEON (four quarters) */
+/* ---- eight floats: AVX2, NEON (two halves) */
 
 #if GKDI_X86
 #define GKDI_WIDE __attribute__((target("avx2,fma")))
 #define GKDI_OP __attribute__((target("avx2,fma"), always_inline)) static inline
-typedef struct gkdi_f {
-    __m256 a, b;
-} gkdi_f;
-typedef struct gkdi_n {
-    __m256i a, b;
-} gkdi_n;
-typedef gkdi_f gkdi_mask;
-GKDI_OP gkdi_f gkdi_v_pair(__m256 a, __m256 b)
-{
-    gkdi_f v;
-    v.a = a;
-    v.b = b;
-    return v;
-}
-GKDI_OP gkdi_n gkdi_v_n_pair(__m256i a, __m256i b)
-{
-    gkdi_n v;
-    v.a = a;
-    v.b = b;
-    return v;
-}
-GKDI_OP gkdi_f gkdi_v_load(const float *p) { return gkdi_v_pair(_mm256_loadu_ps(p), _mm256_loadu_ps(p + 8)); }
-GKDI_OP void gkdi_v_store(float *p, gkdi_f v)
-{
-    _mm256_storeu_ps(p, v.a);
-    _mm256_storeu_ps(p + 8, v.b);
-}
-GKDI_OP gkdi_f gkdi_v_all(float a) { return gkdi_v_pair(_mm256_set1_ps(a), _mm256_set1_ps(a)); }
-#define GKDI_2(op, x, y) gkdi_v_pair(op((x).a, (y).a), op((x).b, (y).b))
-GKDI_OP gkdi_f gkdi_v_add(gkdi_f a, gkdi_f b) { return GKDI_2(_mm256_add_ps, a, b); }
-GKDI_OP gkdi_f gkdi_v_sub(gkdi_f a, gkdi_f b) { return GKDI_2(_mm256_sub_ps, a, b); }
-GKDI_OP gkdi_f gkdi_v_mul(gkdi_f a, gkdi_f b) { return GKDI_2(_mm256_mul_ps, a, b); }
-GKDI_OP gkdi_f gkdi_v_div(gkdi_f a, gkdi_f b) { return GKDI_2(_mm256_div_ps, a, b); }
-GKDI_OP gkdi_f gkdi_v_madd(gkdi_f a, gkdi_f b, gkdi_f c)
-{
-    return gkdi_v_pair(_mm256_fmadd_ps(a.a, b.a, c.a), _mm256_fmadd_ps(a.b, b.b, c.b));
-}
-GKDI_OP gkdi_f gkdi_v_nmadd(gkdi_f a, gkdi_f b, gkdi_f c)
-{
-    return gkdi_v_pair(_mm256_fnmadd_ps(a.a, b.a, c.a), _mm256_fnmadd_ps(a.b, b.b, c.b));
-}
-GKDI_OP gkdi_f gkdi_v_min(gkdi_f a, gkdi_f b) { return GKDI_2(_mm256_min_ps, a, b); } /* b where a is NaN */
-GKDI_OP gkdi_f gkdi_v_max(gkdi_f a, gkdi_f b) { return GKDI_2(_mm256_max_ps, a, b); }
-GKDI_OP gkdi_f gkdi_v_sqrt(gkdi_f v) { return gkdi_v_pair(_mm256_sqrt_ps(v.a), _mm256_sqrt_ps(v.b)); }
-GKDI_OP gkdi_mask gkdi_v_less(gkdi_f a, gkdi_f b)
-{
-    return gkdi_v_pair(_mm256_cmp_ps(a.a, b.a, _CMP_LT_OQ), _mm256_cmp_ps(a.b, b.b, _CMP_LT_OQ));
-}
-GKDI_OP gkdi_mask gkdi_v_both(gkdi_mask a, gkdi_mask b) { return GKDI_2(_mm256_and_ps, a, b); }
-GKDI_OP gkdi_f gkdi_v_where(gkdi_mask a, gkdi_f b) { return GKDI_2(_mm256_and_ps, a, b); }
-GKDI_OP gkdi_f gkdi_v_pick(gkdi_mask m, gkdi_f a, gkdi_f b)
-{
-    return gkdi_v_pair(_mm256_blendv_ps(b.a, a.a, m.a), _mm256_blendv_ps(b.b, a.b, m.b));
-}
-GKDI_OP bool gkdi_v_any(gkdi_mask m) { return _mm256_movemask_ps(_mm256_or_ps(m.a, m.b)) != 0; }
-GKDI_OP gkdi_mask gkdi_v_odd(gkdi_n v)
-{
-    return gkdi_v_pair(_mm256_castsi256_ps(_mm256_slli_epi32(v.a, 31)),
-                       _mm256_castsi256_ps(_mm256_slli_epi32(v.b, 31)));
-}
-GKDI_OP __m256 gkdi_v_negate_two8(__m256 a, __m256i b)
+typedef __m256 gkdi_f;
+typedef __m256i gkdi_n;
+typedef __m256 gkdi_mask;
+GKDI_OP gkdi_f gkdi_v_load(const float *p) { return _mm256_loadu_ps(p); }
+GKDI_OP void gkdi_v_store(float *p, gkdi_f v) { _mm256_storeu_ps(p, v); }
+GKDI_OP gkdi_f gkdi_v_all(float a) { return _mm256_set1_ps(a); }
+GKDI_OP gkdi_f gkdi_v_add(gkdi_f a, gkdi_f b) { return _mm256_add_ps(a, b); }
+GKDI_OP gkdi_f gkdi_v_sub(gkdi_f a, gkdi_f b) { return _mm256_sub_ps(a, b); }
+GKDI_OP gkdi_f gkdi_v_mul(gkdi_f a, gkdi_f b) { return _mm256_mul_ps(a, b); }
+GKDI_OP gkdi_f gkdi_v_div(gkdi_f a, gkdi_f b) { return _mm256_div_ps(a, b); }
+GKDI_OP gkdi_f gkdi_v_madd(gkdi_f a, gkdi_f b, gkdi_f c) { return _mm256_fmadd_ps(a, b, c); }
+GKDI_OP gkdi_f gkdi_v_nmadd(gkdi_f a, gkdi_f b, gkdi_f c) { return _mm256_fnmadd_ps(a, b, c); }
+GKDI_OP gkdi_f gkdi_v_min(gkdi_f a, gkdi_f b) { return _mm256_min_ps(a, b); } /* b where a is NaN */
+GKDI_OP gkdi_f gkdi_v_max(gkdi_f a, gkdi_f b) { return _mm256_max_ps(a, b); }
+GKDI_OP gkdi_f gkdi_v_sqrt(gkdi_f v) { return _mm256_sqrt_ps(v); }
+GKDI_OP gkdi_mask gkdi_v_less(gkdi_f a, gkdi_f b) { return _mm256_cmp_ps(a, b, _CMP_LT_OQ); }
+GKDI_OP gkdi_mask gkdi_v_both(gkdi_mask a, gkdi_mask b) { return _mm256_and_ps(a, b); }
+GKDI_OP gkdi_f gkdi_v_where(gkdi_mask a, gkdi_f b) { return _mm256_and_ps(a, b); }
+GKDI_OP gkdi_f gkdi_v_pick(gkdi_mask m, gkdi_f a, gkdi_f b) { return _mm256_blendv_ps(b, a, m); }
+GKDI_OP bool gkdi_v_any(gkdi_mask m) { return _mm256_movemask_ps(m) != 0; }
+GKDI_OP gkdi_mask gkdi_v_odd(gkdi_n v) { return _mm256_castsi256_ps(_mm256_slli_epi32(v, 31)); }
+GKDI_OP gkdi_f gkdi_v_negate_two(gkdi_f a, gkdi_n b) /* where b & 2 */
 {
     __m256i sign = _mm256_slli_epi32(_mm256_and_si256(b, _mm256_set1_epi32(2)), 30);
     return _mm256_xor_ps(a, _mm256_castsi256_ps(sign));
 }
-GKDI_OP gkdi_f gkdi_v_negate_two(gkdi_f a, gkdi_n b) { return GKDI_2(gkdi_v_negate_two8, a, b); } /* where b & 2 */
-GKDI_OP gkdi_n gkdi_v_next(gkdi_n v)
-{
-    return gkdi_v_n_pair(_mm256_add_epi32(v.a, _mm256_set1_epi32(1)), _mm256_add_epi32(v.b, _mm256_set1_epi32(1)));
-}
-GKDI_OP gkdi_f gkdi_v_float(gkdi_n v) { return gkdi_v_pair(_mm256_cvtepi32_ps(v.a), _mm256_cvtepi32_ps(v.b)); }
-GKDI_OP gkdi_n gkdi_v_truncate(gkdi_f v) { return gkdi_v_n_pair(_mm256_cvttps_epi32(v.a), _mm256_cvttps_epi32(v.b)); }
+GKDI_OP gkdi_n gkdi_v_next(gkdi_n v) { return _mm256_add_epi32(v, _mm256_set1_epi32(1)); }
+GKDI_OP gkdi_f gkdi_v_float(gkdi_n v) { return _mm256_cvtepi32_ps(v); }
+GKDI_OP gkdi_n gkdi_v_truncate(gkdi_f v) { return _mm256_cvttps_epi32(v); }
 GKDI_OP gkdi_f gkdi_v_rsqrt(gkdi_f a) /* relative error 3e-7 */
 {
-    gkdi_f r = gkdi_v_pair(_mm256_rsqrt_ps(a.a), _mm256_rsqrt_ps(a.b)),
-           h = gkdi_v_mul(gkdi_v_mul(a, r), gkdi_v_all(0.5f));
+    gkdi_f r = _mm256_rsqrt_ps(a), h = gkdi_v_mul(gkdi_v_mul(a, r), gkdi_v_all(0.5f));
     return gkdi_v_mul(r, gkdi_v_nmadd(h, r, gkdi_v_all(1.5f)));
 }
-GKDI_OP __m256 gkdi_v_split_exponent8(__m256 a, __m256 *out)
+/* a = 2^e (1 + out), sqrt(1/2) <= 1 + out < sqrt(2); returns e. */
+GKDI_OP gkdi_f gkdi_v_split_exponent(gkdi_f a, gkdi_f *out)
 {
     __m256i bits = _mm256_castps_si256(a), e;
     e = _mm256_srai_epi32(_mm256_sub_epi32(bits, _mm256_set1_epi32(0x3f3504f3)), 23);
     *out = _mm256_sub_ps(_mm256_castsi256_ps(_mm256_sub_epi32(bits, _mm256_slli_epi32(e, 23))), _mm256_set1_ps(1));
     return _mm256_cvtepi32_ps(e);
 }
-/* a = 2^e (1 + out), sqrt(1/2) <= 1 + out < sqrt(2); returns e. */
-GKDI_OP gkdi_f gkdi_v_split_exponent(gkdi_f v, gkdi_f *out)
+GKDI_OP float gkdi_v_sum(gkdi_f a)
 {
-    return gkdi_v_pair(gkdi_v_split_exponent8(v.a, &out->a), gkdi_v_split_exponent8(v.b, &out->b));
-}
-GKDI_OP float gkdi_v_sum(gkdi_f v)
-{
-    __m256 a = _mm256_add_ps(v.a, v.b);
     __m128 s = _mm_add_ps(_mm256_castps256_ps128(a), _mm256_extractf128_ps(a, 1));
     s = _mm_add_ps(s, _mm_movehl_ps(s, s));
     return _mm_cvtss_f32(_mm_add_ss(s, _mm_movehdup_ps(s)));
 }
-GKDI_OP __m256 gkdi_v_prefix8(__m256 a)
+/* Lane i: sum of lanes 0 .. i. */
+GKDI_OP gkdi_f gkdi_v_prefix(gkdi_f a)
 {
     a = _mm256_add_ps(a, _mm256_castsi256_ps(_mm256_slli_si256(_mm256_castps_si256(a), 4)));
     a = _mm256_add_ps(a, _mm256_castsi256_ps(_mm256_slli_si256(_mm256_castps_si256(a), 8)));
     return _mm256_add_ps(a, _mm256_permute_ps(_mm256_permute2f128_ps(a, a, 0x08), 0xff));
 }
-/* Lane i: sum of lanes 0 .. i. */
-GKDI_OP gkdi_f gkdi_v_prefix(gkdi_f v)
-{
-    __m256 a = gkdi_v_prefix8(v.a), last = _mm256_permute_ps(_mm256_permute2f128_ps(a, a, 0x11), 0xff);
-    return gkdi_v_pair(a, _mm256_add_ps(gkdi_v_prefix8(v.b), last));
-}
 GKDI_OP uint32_t gkdi_v_count_at_most(gkdi_f v, float limit)
 {
-    gkdi_f l = gkdi_v_all(limit);
-    uint32_t a = (uint32_t)_mm256_movemask_ps(_mm256_cmp_ps(v.a, l.a, _CMP_LE_OQ));
-    return (uint32_t)__builtin_popcount(a | (uint32_t)_mm256_movemask_ps(_mm256_cmp_ps(v.b, l.b, _CMP_LE_OQ)) << 8);
+    return (uint32_t)__builtin_popcount(
+        (uint32_t)_mm256_movemask_ps(_mm256_cmp_ps(v, _mm256_set1_ps(limit), _CMP_LE_OQ)));
 }
-GKDI_OP __m256 gkdi_v_power8(__m256 s)
+/* 2^t, t already rounded to units of 1/8 by adding 1.5 * 2^20: from a table without the exponent that j/8 adds. */
+GKDI_OP gkdi_f gkdi_v_power(gkdi_f s)
 {
     const __m256 table = _mm256_castsi256_ps(_mm256_setr_epi32(0x3f800000, 0x3f7b95c2, 0x3f7837f0, 0x3f75fed7,
                                                                0x3f7504f3, 0x3f75672a, 0x3f7744fd, 0x3f7ac0c7));
     __m256i y = _mm256_castps_si256(_mm256_permutevar8x32_ps(table, _mm256_castps_si256(s)));
     return _mm256_castsi256_ps(_mm256_add_epi32(y, _mm256_slli_epi32(_mm256_castps_si256(s), 20)));
 }
-/* 2^t for t <= 0: 2^(j/8) from a table without the exponent that j/8 adds, quadratic between: relative error 3.5e-6. */
+/* 2^t for t <= 0: 2^(j/8), quadratic between: relative error 3.5e-6. */
 GKDI_OP gkdi_f gkdi_v_exp2(gkdi_f t)
 {
-    gkdi_f magic = gkdi_v_all(1572864.0f), s, f, p, y; /* 1.5 * 2^20: units of 1/8 */
+    gkdi_f magic = gkdi_v_all(1572864.0f), s, f, p, y;
     t = gkdi_v_max(t, gkdi_v_all(-100));
     s = gkdi_v_add(t, magic);
     f = gkdi_v_sub(t, gkdi_v_sub(s, magic));
-    y = gkdi_v_pair(gkdi_v_power8(s.a), gkdi_v_power8(s.b));
+    y = gkdi_v_power(s);
     p = gkdi_v_madd(f, gkdi_v_all(0.240225888f), gkdi_v_all(0.693308884f));
     return gkdi_v_madd(gkdi_v_mul(f, y), p, y);
 }
@@ -4458,7 +4403,7 @@ GKDI_OP gkdi_f gkdi_v_exp2_fine(gkdi_f t)
     t = gkdi_v_max(t, gkdi_v_all(-100));
     s = gkdi_v_add(t, magic);
     f = gkdi_v_sub(t, gkdi_v_sub(s, magic));
-    y = gkdi_v_pair(gkdi_v_power8(s.a), gkdi_v_power8(s.b));
+    y = gkdi_v_power(s);
     p = gkdi_v_madd(f, gkdi_v_all(0.055496222f), gkdi_v_all(0.240257631f));
     p = gkdi_v_madd(f, p, gkdi_v_all(0.693147214f));
     return gkdi_v_madd(gkdi_v_mul(f, y), p, y);
@@ -4466,10 +4411,8 @@ GKDI_OP gkdi_f gkdi_v_exp2_fine(gkdi_f t)
 /* Lanes from the n-th on. */
 GKDI_OP gkdi_mask gkdi_v_lanes_from(uint32_t n)
 {
-    const __m256i a = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7), least = _mm256_set1_epi32((int32_t)n - 1);
-    __m256i b = _mm256_add_epi32(a, _mm256_set1_epi32(8));
-    return gkdi_v_pair(_mm256_castsi256_ps(_mm256_cmpgt_epi32(a, least)),
-                       _mm256_castsi256_ps(_mm256_cmpgt_epi32(b, least)));
+    return _mm256_castsi256_ps(
+        _mm256_cmpgt_epi32(_mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7), _mm256_set1_epi32((int32_t)n - 1)));
 }
 /* Four rows of four become columns, in both halves. */
 GKDI_OP void gkdi_v_turn4(__m256 r[4])
@@ -4484,9 +4427,9 @@ GKDI_OP void gkdi_v_turn4(__m256 r[4])
 #define GKDI_JOIN(p, q) _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p)), _mm_loadu_ps(q), 1)
 #define GKDI_TWO(p, q)                                                                                                 \
     _mm_loadh_pi(_mm_loadl_pi(_mm_setzero_ps(), (const __m64 *)(const void *)(p)), (const __m64 *)(const void *)(q))
-GKDI_OP void gkdi_v_load_lobes8(const gkd_lobe *lobes, uint32_t n, __m256 out[6])
+/* Eight lobes as columns x, y, z, kappa, weight, nearness; of fewer, the last one repeats with weight 0. */
+GKDI_OP void gkdi_v_load_lobes(const gkd_lobe *lobes, uint32_t n, gkdi_f out[6])
 {
-    const __m256i lanes = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
     const gkd_lobe *l0 = lobes, *l1 = lobes + (n > 1 ? 1 : n - 1), *l2 = lobes + (n > 2 ? 2 : n - 1);
     const gkd_lobe *l3 = lobes + (n > 3 ? 3 : n - 1), *l4 = lobes + (n > 4 ? 4 : n - 1);
     const gkd_lobe *l5 = lobes + (n > 5 ? 5 : n - 1), *l6 = lobes + (n > 6 ? 6 : n - 1);
@@ -4501,27 +4444,11 @@ GKDI_OP void gkdi_v_load_lobes8(const gkd_lobe *lobes, uint32_t n, __m256 out[6]
                              GKDI_TWO(&l4->weight, &l5->weight), 1);
     b = _mm256_insertf128_ps(_mm256_castps128_ps256(GKDI_TWO(&l2->weight, &l3->weight)),
                              GKDI_TWO(&l6->weight, &l7->weight), 1);
-    out[4] = _mm256_shuffle_ps(a, b, 0x88);
+    out[4] = _mm256_andnot_ps(gkdi_v_lanes_from(n), _mm256_shuffle_ps(a, b, 0x88));
     out[5] = _mm256_shuffle_ps(a, b, 0xdd);
-    out[4] = _mm256_and_ps(out[4], _mm256_castsi256_ps(_mm256_cmpgt_epi32(_mm256_set1_epi32((int32_t)n), lanes)));
 }
-/* Sixteen lobes as columns x, y, z, kappa, weight, nearness; of fewer, the last one repeats with weight 0. */
-GKDI_OP void gkdi_v_load_lobes(const gkd_lobe *lobes, uint32_t n, gkdi_f out[6])
-{
-    __m256 a[6], b[6];
-    uint32_t low = n < 8 ? n : 8, k = n > 8 ? 8 : n - 1;
-    gkdi_v_load_lobes8(lobes, low, a);
-    gkdi_v_load_lobes8(lobes + k, n - k, b);
-    if (n <= 8)
-        b[4] = _mm256_setzero_ps();
-    out[0] = gkdi_v_pair(a[0], b[0]);
-    out[1] = gkdi_v_pair(a[1], b[1]);
-    out[2] = gkdi_v_pair(a[2], b[2]);
-    out[3] = gkdi_v_pair(a[3], b[3]);
-    out[4] = gkdi_v_pair(a[4], b[4]);
-    out[5] = gkdi_v_pair(a[5], b[5]);
-}
-GKDI_OP void gkdi_v_load_directions8(const float *p, size_t stride, __m256 out[4])
+/* Eight directions as columns (out[3]: scratch); reads nothing past the last. */
+GKDI_OP void gkdi_v_load_directions(const float *p, size_t stride, gkdi_f out[4])
 {
     const float *q = gkdi_row(p, stride, 4), *last = gkdi_row(p, stride, 7);
     out[0] = GKDI_JOIN(p, q);
@@ -4532,77 +4459,57 @@ GKDI_OP void gkdi_v_load_directions8(const float *p, size_t stride, __m256 out[4
         _mm_movelh_ps(_mm_loadl_pi(_mm_setzero_ps(), (const __m64 *)(const void *)last), _mm_load_ss(last + 2)), 1);
     gkdi_v_turn4(out);
 }
-/* Sixteen directions as columns; reads nothing past the last. */
-GKDI_OP void gkdi_v_load_directions(const float *p, size_t stride, gkdi_f out[4])
-{
-    __m256 a[4], b[4];
-    gkdi_v_load_directions8(p, stride, a);
-    gkdi_v_load_directions8(gkdi_row(p, stride, 8), stride, b);
-    out[0] = gkdi_v_pair(a[0], b[0]);
-    out[1] = gkdi_v_pair(a[1], b[1]);
-    out[2] = gkdi_v_pair(a[2], b[2]);
-}
 GKDI_OP __m256d gkdi_v_wide(__m256 a, bool high)
 {
     return _mm256_cvtps_pd(high ? _mm256_extractf128_ps(a, 1) : _mm256_castps256_ps128(a));
 }
-GKDI_OP __m128 gkdi_v_rises4(__m256 x, __m256 y, __m256 z, const float *n, bool high)
+GKDI_OP __m128 gkdi_v_rises4(const gkdi_f d[3], const float *n, bool high)
 {
-    __m256d s = _mm256_mul_pd(gkdi_v_wide(x, high), _mm256_set1_pd((double)n[0]));
-    s = _mm256_fmadd_pd(gkdi_v_wide(y, high), _mm256_set1_pd((double)n[1]), s);
-    return _mm256_cvtpd_ps(_mm256_fmadd_pd(gkdi_v_wide(z, high), _mm256_set1_pd((double)n[2]), s));
-}
-GKDI_OP __m256 gkdi_v_rises8(__m256 x, __m256 y, __m256 z, const float *n)
-{
-    __m128 a = gkdi_v_rises4(x, y, z, n, false), b = gkdi_v_rises4(x, y, z, n, true);
-    return _mm256_insertf128_ps(_mm256_castps128_ps256(a), b, 1);
+    __m256d s = _mm256_mul_pd(gkdi_v_wide(d[0], high), _mm256_set1_pd((double)n[0]));
+    s = _mm256_fmadd_pd(gkdi_v_wide(d[1], high), _mm256_set1_pd((double)n[1]), s);
+    return _mm256_cvtpd_ps(_mm256_fmadd_pd(gkdi_v_wide(d[2], high), _mm256_set1_pd((double)n[2]), s));
 }
 /* Cosines with one normal, by doubles. */
 GKDI_OP gkdi_f gkdi_v_rises(const gkdi_f d[3], const float *n)
 {
-    return gkdi_v_pair(gkdi_v_rises8(d[0].a, d[1].a, d[2].a, n), gkdi_v_rises8(d[0].b, d[1].b, d[2].b, n));
+    __m128 a = gkdi_v_rises4(d, n, false), b = gkdi_v_rises4(d, n, true);
+    return _mm256_insertf128_ps(_mm256_castps128_ps256(a), b, 1);
 }
 #elif GKDI_NEON
 #define GKDI_WIDE
 #define GKDI_OP __attribute__((always_inline)) static inline
 typedef struct gkdi_f {
-    float32x4_t a, b, c, d;
+    float32x4_t a, b;
 } gkdi_f;
 typedef struct gkdi_n {
-    int32x4_t a, b, c, d;
+    int32x4_t a, b;
 } gkdi_n;
 typedef struct gkdi_mask {
-    uint32x4_t a, b, c, d;
+    uint32x4_t a, b;
 } gkdi_mask;
-/* Function name(x, y, ...) of type from op on quarters. */
-#define GKDI_QUARTERS1(type, name, op, t)                                                                              \
+/* Function name(x, ...) of type from op on halves. */
+#define GKDI_HALVES1(type, name, op, t)                                                                                \
     GKDI_OP type name(t x)                                                                                             \
     {                                                                                                                  \
         type v;                                                                                                        \
         v.a = op(x.a);                                                                                                 \
         v.b = op(x.b);                                                                                                 \
-        v.c = op(x.c);                                                                                                 \
-        v.d = op(x.d);                                                                                                 \
         return v;                                                                                                      \
     }
-#define GKDI_QUARTERS2(type, name, op, t)                                                                              \
+#define GKDI_HALVES2(type, name, op, t)                                                                                \
     GKDI_OP type name(t x, t y)                                                                                        \
     {                                                                                                                  \
         type v;                                                                                                        \
         v.a = op(x.a, y.a);                                                                                            \
         v.b = op(x.b, y.b);                                                                                            \
-        v.c = op(x.c, y.c);                                                                                            \
-        v.d = op(x.d, y.d);                                                                                            \
         return v;                                                                                                      \
     }
-#define GKDI_QUARTERS3(name, op, t)                                                                                    \
+#define GKDI_HALVES3(name, op, t)                                                                                      \
     GKDI_OP gkdi_f name(t x, gkdi_f y, gkdi_f z)                                                                       \
     {                                                                                                                  \
         gkdi_f v;                                                                                                      \
         v.a = op(x.a, y.a, z.a);                                                                                       \
         v.b = op(x.b, y.b, z.b);                                                                                       \
-        v.c = op(x.c, y.c, z.c);                                                                                       \
-        v.d = op(x.d, y.d, z.d);                                                                                       \
         return v;                                                                                                      \
     }
 GKDI_OP gkdi_f gkdi_v_load(const float *p)
@@ -4610,45 +4517,41 @@ GKDI_OP gkdi_f gkdi_v_load(const float *p)
     gkdi_f v;
     v.a = vld1q_f32(p);
     v.b = vld1q_f32(p + 4);
-    v.c = vld1q_f32(p + 8);
-    v.d = vld1q_f32(p + 12);
     return v;
 }
 GKDI_OP void gkdi_v_store(float *p, gkdi_f v)
 {
     vst1q_f32(p, v.a);
     vst1q_f32(p + 4, v.b);
-    vst1q_f32(p + 8, v.c);
-    vst1q_f32(p + 12, v.d);
 }
 GKDI_OP gkdi_f gkdi_v_all(float a)
 {
     gkdi_f v;
-    v.a = v.b = v.c = v.d = vdupq_n_f32(a);
+    v.a = v.b = vdupq_n_f32(a);
     return v;
 }
-GKDI_QUARTERS2(gkdi_f, gkdi_v_add, vaddq_f32, gkdi_f)
-GKDI_QUARTERS2(gkdi_f, gkdi_v_sub, vsubq_f32, gkdi_f)
-GKDI_QUARTERS2(gkdi_f, gkdi_v_mul, vmulq_f32, gkdi_f)
-GKDI_QUARTERS2(gkdi_f, gkdi_v_div, vdivq_f32, gkdi_f)
-GKDI_QUARTERS2(gkdi_f, gkdi_v_min, vminnmq_f32, gkdi_f) /* y where x is NaN */
-GKDI_QUARTERS2(gkdi_f, gkdi_v_max, vmaxnmq_f32, gkdi_f)
-GKDI_QUARTERS2(gkdi_mask, gkdi_v_less, vcltq_f32, gkdi_f)
-GKDI_QUARTERS2(gkdi_mask, gkdi_v_both, vandq_u32, gkdi_mask)
-GKDI_QUARTERS1(gkdi_f, gkdi_v_sqrt, vsqrtq_f32, gkdi_f)
+GKDI_HALVES2(gkdi_f, gkdi_v_add, vaddq_f32, gkdi_f)
+GKDI_HALVES2(gkdi_f, gkdi_v_sub, vsubq_f32, gkdi_f)
+GKDI_HALVES2(gkdi_f, gkdi_v_mul, vmulq_f32, gkdi_f)
+GKDI_HALVES2(gkdi_f, gkdi_v_div, vdivq_f32, gkdi_f)
+GKDI_HALVES2(gkdi_f, gkdi_v_min, vminnmq_f32, gkdi_f) /* y where x is NaN */
+GKDI_HALVES2(gkdi_f, gkdi_v_max, vmaxnmq_f32, gkdi_f)
+GKDI_HALVES2(gkdi_mask, gkdi_v_less, vcltq_f32, gkdi_f)
+GKDI_HALVES2(gkdi_mask, gkdi_v_both, vandq_u32, gkdi_mask)
+GKDI_HALVES1(gkdi_f, gkdi_v_sqrt, vsqrtq_f32, gkdi_f)
 #define GKDI_MADD4(x, y, z) vfmaq_f32(z, x, y)
 #define GKDI_NMADD4(x, y, z) vfmsq_f32(z, x, y)
-GKDI_QUARTERS3(gkdi_v_madd, GKDI_MADD4, gkdi_f)
-GKDI_QUARTERS3(gkdi_v_nmadd, GKDI_NMADD4, gkdi_f)
-GKDI_QUARTERS3(gkdi_v_pick, vbslq_f32, gkdi_mask)
+GKDI_HALVES3(gkdi_v_madd, GKDI_MADD4, gkdi_f)
+GKDI_HALVES3(gkdi_v_nmadd, GKDI_NMADD4, gkdi_f)
+GKDI_HALVES3(gkdi_v_pick, vbslq_f32, gkdi_mask)
 GKDI_OP gkdi_f gkdi_v_where(gkdi_mask m, gkdi_f x) { return gkdi_v_pick(m, x, gkdi_v_all(0)); }
-GKDI_OP bool gkdi_v_any(gkdi_mask m) { return vmaxvq_u32(vorrq_u32(vorrq_u32(m.a, m.b), vorrq_u32(m.c, m.d))) != 0; }
+GKDI_OP bool gkdi_v_any(gkdi_mask m) { return vmaxvq_u32(vorrq_u32(m.a, m.b)) != 0; }
 #define GKDI_ODD4(x) vtstq_s32(x, vdupq_n_s32(1))
 #define GKDI_NEXT4(x) vaddq_s32(x, vdupq_n_s32(1))
-GKDI_QUARTERS1(gkdi_mask, gkdi_v_odd, GKDI_ODD4, gkdi_n)
-GKDI_QUARTERS1(gkdi_n, gkdi_v_next, GKDI_NEXT4, gkdi_n)
-GKDI_QUARTERS1(gkdi_f, gkdi_v_float, vcvtq_f32_s32, gkdi_n)
-GKDI_QUARTERS1(gkdi_n, gkdi_v_truncate, vcvtq_s32_f32, gkdi_f)
+GKDI_HALVES1(gkdi_mask, gkdi_v_odd, GKDI_ODD4, gkdi_n)
+GKDI_HALVES1(gkdi_n, gkdi_v_next, GKDI_NEXT4, gkdi_n)
+GKDI_HALVES1(gkdi_f, gkdi_v_float, vcvtq_f32_s32, gkdi_n)
+GKDI_HALVES1(gkdi_n, gkdi_v_truncate, vcvtq_s32_f32, gkdi_f)
 GKDI_OP float32x4_t gkdi_v_negate_two4(float32x4_t x, int32x4_t k)
 {
     int32x4_t sign = vshlq_n_s32(vandq_s32(k, vdupq_n_s32(2)), 30);
@@ -4658,8 +4561,6 @@ GKDI_OP gkdi_f gkdi_v_negate_two(gkdi_f x, gkdi_n k) /* where k & 2 */
 {
     x.a = gkdi_v_negate_two4(x.a, k.a);
     x.b = gkdi_v_negate_two4(x.b, k.b);
-    x.c = gkdi_v_negate_two4(x.c, k.c);
-    x.d = gkdi_v_negate_two4(x.d, k.d);
     return x;
 }
 GKDI_OP gkdi_f gkdi_v_rsqrt(gkdi_f x) { return gkdi_v_div(gkdi_v_all(1), gkdi_v_sqrt(x)); }
@@ -4675,11 +4576,9 @@ GKDI_OP gkdi_f gkdi_v_split_exponent(gkdi_f x, gkdi_f *out)
     gkdi_f e;
     e.a = gkdi_v_split_exponent4(x.a, &out->a);
     e.b = gkdi_v_split_exponent4(x.b, &out->b);
-    e.c = gkdi_v_split_exponent4(x.c, &out->c);
-    e.d = gkdi_v_split_exponent4(x.d, &out->d);
     return e;
 }
-GKDI_OP float gkdi_v_sum(gkdi_f v) { return vaddvq_f32(vaddq_f32(vaddq_f32(v.a, v.b), vaddq_f32(v.c, v.d))); }
+GKDI_OP float gkdi_v_sum(gkdi_f v) { return vaddvq_f32(vaddq_f32(v.a, v.b)); }
 GKDI_OP float32x4_t gkdi_v_prefix4(float32x4_t a, float before)
 {
     float32x4_t zero = vdupq_n_f32(0);
@@ -4692,21 +4591,18 @@ GKDI_OP gkdi_f gkdi_v_prefix(gkdi_f v)
 {
     v.a = gkdi_v_prefix4(v.a, 0);
     v.b = gkdi_v_prefix4(v.b, vgetq_lane_f32(v.a, 3));
-    v.c = gkdi_v_prefix4(v.c, vgetq_lane_f32(v.b, 3));
-    v.d = gkdi_v_prefix4(v.d, vgetq_lane_f32(v.c, 3));
     return v;
 }
 #define GKDI_AT_MOST4(x) vshrq_n_u32(vcleq_f32(x, l), 31)
 GKDI_OP uint32_t gkdi_v_count_at_most(gkdi_f v, float limit)
 {
     float32x4_t l = vdupq_n_f32(limit);
-    return vaddvq_u32(vaddq_u32(vaddq_u32(GKDI_AT_MOST4(v.a), GKDI_AT_MOST4(v.b)),
-                                vaddq_u32(GKDI_AT_MOST4(v.c), GKDI_AT_MOST4(v.d))));
+    return vaddvq_u32(vaddq_u32(GKDI_AT_MOST4(v.a), GKDI_AT_MOST4(v.b)));
 }
 /* Lanes from the n-th on. */
 GKDI_OP gkdi_mask gkdi_v_lanes_from(uint32_t n)
 {
-    static const float lanes[16] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+    static const float lanes[8] = {0, 1, 2, 3, 4, 5, 6, 7};
     return gkdi_v_less(gkdi_v_all((float)n - 0.5f), gkdi_v_load(lanes));
 }
 /* As gkd_exp2. */
@@ -4724,14 +4620,14 @@ GKDI_OP float32x4_t gkdi_v_exp2_4(float32x4_t t)
     p = vfmaq_f32(vdupq_n_f32(1), f, p);
     return vreinterpretq_f32_s32(vaddq_s32(vreinterpretq_s32_f32(p), vshlq_n_s32(n, 23)));
 }
-GKDI_QUARTERS1(gkdi_f, gkdi_v_exp2, gkdi_v_exp2_4, gkdi_f)
+GKDI_HALVES1(gkdi_f, gkdi_v_exp2, gkdi_v_exp2_4, gkdi_f)
 GKDI_OP gkdi_f gkdi_v_exp2_fine(gkdi_f t) { return gkdi_v_exp2(t); }
-/* Sixteen lobes as columns x, y, z, kappa, weight, nearness; of fewer, the last one repeats with weight 0. */
+/* Eight lobes as columns x, y, z, kappa, weight, nearness; of fewer, the last one repeats with weight 0. */
 GKDI_OP void gkdi_v_load_lobes(const gkd_lobe *lobes, uint32_t n, gkdi_f out[6])
 {
-    float column[6][16];
+    float column[6][8];
     uint32_t i, k;
-    for (i = 0; i < 16; ++i) {
+    for (i = 0; i < 8; ++i) {
         const gkd_lobe *p = lobes + (i < n ? i : n - 1);
         for (k = 0; k < 3; ++k)
             column[k][i] = p->mean[k];
@@ -4742,12 +4638,12 @@ GKDI_OP void gkdi_v_load_lobes(const gkd_lobe *lobes, uint32_t n, gkdi_f out[6])
     for (k = 0; k < 6; ++k)
         out[k] = gkdi_v_load(column[k]);
 }
-/* Sixteen directions as columns. */
+/* Eight directions as columns. */
 GKDI_OP void gkdi_v_load_directions(const float *p, size_t stride, gkdi_f out[4])
 {
-    float column[3][16];
+    float column[3][8];
     uint32_t i, k;
-    for (i = 0; i < 16; ++i)
+    for (i = 0; i < 8; ++i)
         for (k = 0; k < 3; ++k)
             column[k][i] = gkdi_row(p, stride, i)[k];
     for (k = 0; k < 3; ++k)
@@ -4769,8 +4665,6 @@ GKDI_OP gkdi_f gkdi_v_rises(const gkdi_f d[3], const float *n)
     gkdi_f v;
     v.a = gkdi_v_rises4(d[0].a, d[1].a, d[2].a, n);
     v.b = gkdi_v_rises4(d[0].b, d[1].b, d[2].b, n);
-    v.c = gkdi_v_rises4(d[0].c, d[1].c, d[2].c, n);
-    v.d = gkdi_v_rises4(d[0].d, d[1].d, d[2].d, n);
     return v;
 }
 #endif
@@ -4790,7 +4684,7 @@ GKDI_OP gkdi_f gkdi_v_dot(gkdi_f ax, gkdi_f ay, gkdi_f az, gkdi_f bx, gkdi_f by,
 GKDI_OP gkdi_f gkdi_pdf_lanes(const gkd_handle *handle, const float d[3])
 {
     gkdi_f x = gkdi_v_all(d[0]), y = gkdi_v_all(d[1]), z = gkdi_v_all(d[2]), sum = gkdi_v_all(0), lift;
-    uint32_t i, blocks = (handle->count + 15) / 16;
+    uint32_t i, blocks = (handle->count + 7) / 8;
     bool surface = handle->surface != 0;
     float c = surface ? gkd_dot(d, handle->normal) : 1;
     if (!(c > 0))
@@ -4826,19 +4720,19 @@ GKDI_WIDE static void gkdi_pdf_batch_wide(uint32_t count, const uint32_t *index,
     }
 }
 
-/* Sixteen directions of one handle without a surface; lanes are directions. */
+/* Eight directions of one handle without a surface; lanes are directions. */
 GKDI_OP gkdi_f gkdi_pdf_sphere(const gkd_handle *handle, const gkdi_f d[3])
 {
     gkdi_f sum = gkdi_v_all(0);
     uint32_t k, l, end;
-    for (k = 0; k < handle->count; k += 16) {
-        const float *b = (const float *)(const void *)&handle->block[k / 16]; /* columns are 16 apart */
-        end = handle->count - k < 16 ? handle->count - k : 16;
+    for (k = 0; k < handle->count; k += 8) {
+        const float *b = (const float *)(const void *)&handle->block[k / 8]; /* columns are 8 apart */
+        end = handle->count - k < 8 ? handle->count - k : 8;
         for (l = 0; l < end; ++l, ++b) {
-            gkdi_f x = gkdi_v_sub(d[0], gkdi_v_all(b[0])), y = gkdi_v_sub(d[1], gkdi_v_all(b[16])),
-                   z = gkdi_v_sub(d[2], gkdi_v_all(b[32]));
-            x = gkdi_v_mul(gkdi_v_dot(x, y, z, x, y, z), gkdi_v_all(-b[48]));
-            sum = gkdi_v_madd(gkdi_v_exp2(x), gkdi_v_all(b[80]), sum);
+            gkdi_f x = gkdi_v_sub(d[0], gkdi_v_all(b[0])), y = gkdi_v_sub(d[1], gkdi_v_all(b[8])),
+                   z = gkdi_v_sub(d[2], gkdi_v_all(b[16]));
+            x = gkdi_v_mul(gkdi_v_dot(x, y, z, x, y, z), gkdi_v_all(-b[24]));
+            sum = gkdi_v_madd(gkdi_v_exp2(x), gkdi_v_all(b[40]), sum);
         }
     }
     return sum;
@@ -4849,30 +4743,30 @@ GKDI_OP gkdi_f gkdi_pdf_above(const gkd_handle *handle, const gkdi_f d[3], gkdi_
 {
     gkdi_f sum = gkdi_v_all(0);
     uint32_t k, l, end;
-    for (k = 0; k < handle->count; k += 16) {
-        const float *b = (const float *)(const void *)&handle->block[k / 16];
-        end = handle->count - k < 16 ? handle->count - k : 16;
+    for (k = 0; k < handle->count; k += 8) {
+        const float *b = (const float *)(const void *)&handle->block[k / 8];
+        end = handle->count - k < 8 ? handle->count - k : 8;
         for (l = 0; l < end; ++l, ++b) {
-            gkdi_f x = gkdi_v_sub(d[0], gkdi_v_all(b[0])), y = gkdi_v_sub(d[1], gkdi_v_all(b[16])),
-                   z = gkdi_v_sub(d[2], gkdi_v_all(b[32])), p;
-            x = gkdi_v_mul(gkdi_v_dot(x, y, z, x, y, z), gkdi_v_all(-b[48]));
+            gkdi_f x = gkdi_v_sub(d[0], gkdi_v_all(b[0])), y = gkdi_v_sub(d[1], gkdi_v_all(b[8])),
+                   z = gkdi_v_sub(d[2], gkdi_v_all(b[16])), p;
+            x = gkdi_v_mul(gkdi_v_dot(x, y, z, x, y, z), gkdi_v_all(-b[24]));
             p = gkdi_v_exp2(x);
-            if (gkdi_v_any(gkdi_v_less(gkdi_v_mul(least, gkdi_v_all(b[64])), gkdi_v_all(26))))
-                p = gkdi_v_add(p, gkdi_v_exp2(gkdi_v_nmadd(c, gkdi_v_all(b[64]), x)));
-            sum = gkdi_v_madd(p, gkdi_v_all(b[80]), sum);
+            if (gkdi_v_any(gkdi_v_less(gkdi_v_mul(least, gkdi_v_all(b[32])), gkdi_v_all(26))))
+                p = gkdi_v_add(p, gkdi_v_exp2(gkdi_v_nmadd(c, gkdi_v_all(b[32]), x)));
+            sum = gkdi_v_madd(p, gkdi_v_all(b[40]), sum);
         }
     }
     return sum;
 }
 
-/* One handle, count directions, a multiple of 16. */
+/* One handle, count directions, a multiple of 8. */
 GKDI_WIDE static void gkdi_pdf_same_wide(const gkd_handle *handle, uint32_t count, const float *directions,
                                          size_t stride, float *pdf)
 {
     const float *n = handle->normal, e = handle->uniform;
     bool surface = handle->surface != 0;
     uint32_t i;
-    for (i = 0; i < count; i += 16) {
+    for (i = 0; i < count; i += 8) {
         gkdi_f d[4], sum;
         gkdi_v_load_directions(gkdi_row(directions, stride, i), stride, d);
         if (surface) {
@@ -4902,47 +4796,49 @@ GKDI_512_OP __m512 gkdi_exp2_512(__m512 t)
     return _mm512_maskz_scalef_ps(0xffff, p, t);
 }
 
+GKDI_512_OP __m512 gkdi_join_512(__m256 a, __m256 b) { return _mm512_insertf32x8(_mm512_castps256_ps512(a), b, 1); }
+
 /* gkdi_pdf_sphere or, with a surface, gkdi_pdf_above. */
 GKDI_512_OP __m512 gkdi_pdf_sum_512(const gkd_handle *handle, const __m512 d[3], __m512 c, __m512 least, bool surface)
 {
     __m512 sum = _mm512_setzero_ps();
     uint32_t k, l, end;
-    for (k = 0; k < handle->count; k += 16) {
-        const float *b = (const float *)(const void *)&handle->block[k / 16];
-        end = handle->count - k < 16 ? handle->count - k : 16;
+    for (k = 0; k < handle->count; k += 8) {
+        const float *b = (const float *)(const void *)&handle->block[k / 8];
+        end = handle->count - k < 8 ? handle->count - k : 8;
         for (l = 0; l < end; ++l, ++b) {
-            __m512 x = _mm512_sub_ps(d[0], _mm512_set1_ps(b[0])), y = _mm512_sub_ps(d[1], _mm512_set1_ps(b[16]));
-            __m512 z = _mm512_sub_ps(d[2], _mm512_set1_ps(b[32])), lift, p;
+            __m512 x = _mm512_sub_ps(d[0], _mm512_set1_ps(b[0])), y = _mm512_sub_ps(d[1], _mm512_set1_ps(b[8]));
+            __m512 z = _mm512_sub_ps(d[2], _mm512_set1_ps(b[16])), lift, p;
             x = _mm512_fmadd_ps(x, x, _mm512_fmadd_ps(y, y, _mm512_mul_ps(z, z)));
-            x = _mm512_fnmadd_ps(x, _mm512_set1_ps(b[48]), _mm512_setzero_ps());
+            x = _mm512_fnmadd_ps(x, _mm512_set1_ps(b[24]), _mm512_setzero_ps());
             p = gkdi_exp2_512(x);
             if (surface) {
-                lift = _mm512_set1_ps(b[64]);
+                lift = _mm512_set1_ps(b[32]);
                 if (_mm512_cmp_ps_mask(_mm512_mul_ps(least, lift), _mm512_set1_ps(26), _CMP_LT_OQ))
                     p = _mm512_add_ps(p, gkdi_exp2_512(_mm512_fnmadd_ps(c, lift, x)));
             }
-            sum = _mm512_fmadd_ps(p, _mm512_set1_ps(b[80]), sum);
+            sum = _mm512_fmadd_ps(p, _mm512_set1_ps(b[40]), sum);
         }
     }
     return sum;
 }
 
-/* gkdi_pdf_same_wide. */
+/* gkdi_pdf_same_wide, a multiple of 16. */
 GKDI_512 static void gkdi_pdf_same_512(const gkd_handle *handle, uint32_t count, const float *directions, size_t stride,
                                        float *pdf)
 {
     const float e = handle->uniform;
     uint32_t i, k;
     for (i = 0; i < count; i += 16) {
-        gkdi_f rows[4], rise;
+        gkdi_f a[4], b[4];
         __m512 d[3], sum, c = _mm512_setzero_ps();
         __mmask16 above;
-        gkdi_v_load_directions(gkdi_row(directions, stride, i), stride, rows);
+        gkdi_v_load_directions(gkdi_row(directions, stride, i), stride, a);
+        gkdi_v_load_directions(gkdi_row(directions, stride, i + 8), stride, b);
         for (k = 0; k < 3; ++k)
-            d[k] = _mm512_insertf32x8(_mm512_castps256_ps512(rows[k].a), rows[k].b, 1);
+            d[k] = gkdi_join_512(a[k], b[k]);
         if (handle->surface) {
-            rise = gkdi_v_rises(rows, handle->normal);
-            c = _mm512_insertf32x8(_mm512_castps256_ps512(rise.a), rise.b, 1);
+            c = gkdi_join_512(gkdi_v_rises(a, handle->normal), gkdi_v_rises(b, handle->normal));
             above = _mm512_cmp_ps_mask(c, _mm512_setzero_ps(), _CMP_GT_OQ);
             sum = gkdi_pdf_sum_512(handle, d, c, _mm512_mask_blend_ps(above, _mm512_set1_ps(2), c), true);
             sum = _mm512_maskz_mov_ps(above, sum);
@@ -5072,7 +4968,7 @@ GKDI_OP void gkdi_tilt_lobes(gkd_lobe_block *b, const float *normal)
 /* Scale, sums of weights, falloff. */
 GKDI_OP void gkdi_finish_lobes(gkd_handle *handle, bool product)
 {
-    uint32_t i, count = handle->count, blocks = (count + 15) / 16;
+    uint32_t i, count = handle->count, blocks = (count + 7) / 8;
     gkdi_f total = gkdi_v_all(0);
     float sum;
     for (i = 0; i < blocks; ++i)
@@ -5095,7 +4991,7 @@ GKDI_OP void gkdi_finish_lobes(gkd_handle *handle, bool product)
         if (i + 1 < blocks)
             sum += gkdi_v_sum(w);
         else
-            upper = gkdi_v_pick(gkdi_v_lanes_from(count - 1 - i * 16), gkdi_v_all(1), upper);
+            upper = gkdi_v_pick(gkdi_v_lanes_from(count - 1 - i * 8), gkdi_v_all(1), upper);
         gkdi_v_store(b->upper, upper);
     }
 }
@@ -5113,17 +5009,17 @@ GKDI_WIDE static void gkdi_orient_wide(uint32_t count, const gkdi_view_from *fro
             __builtin_prefetch(from[i].lobes + k);
     }
     for (i = 0; i < count; ++i)
-        for (k = 0; k < from[i].count; k += 16)
-            gkdi_turn_lobes(&from[i].handle->block[k / 16], from[i].lobes + k, from[i].count - k, offset[i]);
+        for (k = 0; k < from[i].count; k += 8)
+            gkdi_turn_lobes(&from[i].handle->block[k / 8], from[i].lobes + k, from[i].count - k, offset[i]);
     for (i = 0; i < count; ++i)
-        for (k = 0; surface[i] && k < from[i].count; k += 16)
-            gkdi_weigh_lobes(&from[i].handle->block[k / 16], from[i].handle->normal, product);
+        for (k = 0; surface[i] && k < from[i].count; k += 8)
+            gkdi_weigh_lobes(&from[i].handle->block[k / 8], from[i].handle->normal, product);
     for (i = 0; i < count; ++i)
-        for (k = 0; k < from[i].count; k += 16) {
+        for (k = 0; k < from[i].count; k += 8) {
             if (surface[i])
-                gkdi_tilt_lobes(&from[i].handle->block[k / 16], from[i].handle->normal);
+                gkdi_tilt_lobes(&from[i].handle->block[k / 8], from[i].handle->normal);
             else
-                gkdi_v_store(from[i].handle->block[k / 16].lift, gkdi_v_all(0));
+                gkdi_v_store(from[i].handle->block[k / 8].lift, gkdi_v_all(0));
         }
     for (i = 0; i < count; ++i)
         gkdi_finish_lobes(from[i].handle, product);
@@ -5170,7 +5066,7 @@ GKDI_OP void gkdi_circle(gkdi_f u, gkdi_f *sine, gkdi_f *cosine)
     *cosine = gkdi_v_negate_two(gkdi_v_pick(odd, s, c), gkdi_v_next(k));
 }
 
-/* gkd_draw_direction of sixteen draws from lane i on. */
+/* gkd_draw_direction of eight draws from lane i on. */
 GKDI_WIDE static void gkdi_draw_directions(gkdi_draws *d, uint32_t i)
 {
     gkdi_f m[3], n[3], w[3], one = gkdi_v_all(1), zero = gkdi_v_all(0), v, s, c, radius, sign, a, b, k;
@@ -5208,7 +5104,7 @@ GKDI_WIDE static void gkdi_draw_directions(gkdi_draws *d, uint32_t i)
 GKDI_OP void gkdi_choose_lobe(const gkd_handle *handle, const float *u, gkdi_draws *d, uint32_t i)
 {
     float e = handle->uniform, extra = gkd_extend_random(u), r = (u[0] - e) / (1 - e);
-    uint32_t k, n = 0, blocks = (handle->count + 15) / 16;
+    uint32_t k, n = 0, blocks = (handle->count + 7) / 8;
     gkd_draw draw;
     if (u[0] < e)
         gkd_draw_uniform(u[0], extra, e, &draw);
@@ -5241,7 +5137,7 @@ GKDI_WIDE static void gkdi_sample_batch_wide(uint32_t count, const uint32_t *ind
             uint32_t at = gkdi_at(index, start + i);
             gkdi_choose_lobe(&handles[at], gkdi_row(u, u_stride, at), &draws, i);
         }
-        for (i = 0; i < n; i += 16)
+        for (i = 0; i < n; i += 8)
             gkdi_draw_directions(&draws, i);
         for (i = 0; i < n; ++i) {
             uint32_t at = gkdi_at(index, start + i);
@@ -5293,13 +5189,16 @@ GKD_API void gkd_pdf_directions(const gkd_view *view, const gkd_handle *handle, 
     uint32_t i = 0;
 #if GKDI_X86 || GKDI_NEON
     if (view->simd > GKD_SIMD_SCALAR) {
-        i = count & ~15u;
 #if GKDI_X86
-        if (view->simd == GKD_SIMD_AVX512)
+        if (view->simd == GKD_SIMD_AVX512) {
+            i = count & ~15u;
             gkdi_pdf_same_512(handle, i, directions, stride, pdf);
-        else
+        } else
 #endif
+        {
+            i = count & ~7u;
             gkdi_pdf_same_wide(handle, i, directions, stride, pdf);
+        }
     }
 #endif
     (void)view;

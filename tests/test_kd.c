@@ -345,7 +345,7 @@ static void test_sizes_are_as_documented(void **state)
     assert_int_equal(sizeof(gkd_lobe), 24);
     assert_int_equal(sizeof(gkd_cell), 32);
     assert_int_equal(sizeof(gkd_node), 8);
-    assert_int_equal(sizeof(gkd_lobe_block), 448);
+    assert_int_equal(sizeof(gkd_lobe_block), 224);
     assert_int_equal(offsetof(gkd_handle, block), 64);
     assert_int_equal(sizeof(gkd_stats) % 8, 0);
 }
@@ -561,15 +561,15 @@ static void test_the_lamp_is_found_from_everywhere_in_a_cell(void **state)
         uint32_t best = 0;
         float most = 0, upper = 0;
         for (uint32_t k = 0; k < h.count; ++k) {
-            float now = h.block[k / 16].upper[k % 16];
+            float now = h.block[k / 8].upper[k % 8];
             if (now - upper > most) {
                 most = now - upper;
                 best = k;
             }
             upper = now;
         }
-        b = &h.block[best / 16];
-        float mean[3] = {b->x[best % 16], b->y[best % 16], b->z[best % 16]};
+        b = &h.block[best / 8];
+        float mean[3] = {b->x[best % 8], b->y[best % 8], b->z[best % 8]};
         assert_true(dot(mean, to) > cos(0.2));
     }
     free(s);
