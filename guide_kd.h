@@ -135,8 +135,9 @@
 #ifndef GKD_API /* linkage of the functions; e.g. static */
 #define GKD_API extern
 #endif
-#ifndef GKD_QUERY /* qualifiers of the inline queries; e.g. __device__ static inline */
+#ifndef GKD_QUERY /* qualifiers of the inline queries; e.g. __device__ static inline: then they call nothing */
 #define GKD_QUERY static inline
+#define GKD_QUERY_SIMD 1
 #endif
 /* Other macros, read by the implementation only: GKD_ASSERT(x), GKD_MALLOC(n), GKD_FREE(p), GKD_NO_SIMD. */
 
@@ -392,9 +393,17 @@ typedef struct gkd_handle {
     float alpha, reflected;
     float normal[3];      /* 0 = full sphere. Else directions below are mirrored up: p'(w) = p(w) + p(mirrored w) */
     float uniform;        /* e: share of uniform sphere sampling */
-    uint32_t reserved[7]; /* the blocks start at byte 64 */
+    uint32_t simd;        /* level of the view that found it: gkd_sample and gkd_pdf use it */
+    uint32_t reserved[6]; /* the blocks start at byte 64 */
     gkd_lobe_block block[GKD_MAX_LOBES / 8]; /* (count + 7) / 8 are set */
 } gkd_handle;
+
+/* Find, sample and pdf of one, by the SIMD level: what the inline functions call, unless GKD_QUERY is defined. About
+   twice the time of batches: one waits for its own results. [any thread] */
+GKD_API void gkd_find_one(const gkd_view *view, const float position[3], const float *normal, const float *u,
+                          gkd_handle *handle);
+GKD_API float gkd_sample_one(const gkd_handle *handle, const float u[2], float direction[3]);
+GKD_API float gkd_pdf_one(const gkd_handle *handle, const float direction[3]);
 
 #define GKD_LN2 0.69314718055994531f
 #define GKD_LOG2E 1.44269504088896341f
@@ -444,29 +453,27 @@ GKD_QUERY float gkd_minus_log1m(float y)
     e = (int32_t)(bits - 0x3f3504f3u) >> 23;
     bits -= (uint32_t)e << 23;
     memcpy(&t, &bits, sizeof t);
-    d = e == 0 ? -y : t - 1;
+    d = t - 1;
+    d += (float)(e == 0) * (-y - d); /* -y there: exact; no branch */
     z = d / (2 + d);
     q = z * z;
     q = 2 * z * (1 + q * (1.0f / 3 + q * (1.0f / 5 + q * (1.0f / 7 + q * (1.0f / 9)))));
     return -(q + (float)e * GKD_LN2);
 }
 
-/* Sine and cosine of 2 pi u. */
+/* sin(2 pi x) for |x| <= 1/4; minimax: error 2e-7, of rounding. */
+GKD_QUERY float gkd_sine(float x)
+{
+    float q = x * x;
+    return x * (6.2831852f + q * (-41.341655f + q * (81.601004f + q * (-76.549782f + q * 39.536707f))));
+}
+
+/* Sine and cosine of 2 pi u, 0 <= u < 1, without branches, which could not be predicted. */
 GKD_QUERY void gkd_circle(float u, float *sine, float *cosine)
 {
-    float f = u * 4, x, s, c, q;
-    int32_t k = (int32_t)(f + 0.5f);
-    f -= (float)k;
-    x = f * (GKD_PI / 2);
-    q = x * x;
-    s = x * (1 + q * (-1.0f / 6 + q * (1.0f / 120 + q * (-1.0f / 5040))));
-    c = 1 + q * (-1.0f / 2 + q * (1.0f / 24 + q * (-1.0f / 720 + q * (1.0f / 40320))));
-    *sine = k & 1 ? c : s;
-    *cosine = k & 1 ? s : c;
-    if (k & 2)
-        *sine = -*sine;
-    if ((k + 1) & 2)
-        *cosine = -*cosine;
+    float d = 0.5f - u;
+    *sine = gkd_sine(gkd_most(gkd_least(d, 0.5f - d), -0.5f - d));
+    *cosine = gkd_sine(fabsf(d) - 0.25f);
 }
 
 /* a . b without cancellation. */
@@ -612,6 +619,7 @@ GKD_QUERY bool gkd_place_handle(gkd_handle *handle, const float pivot[3], const 
     bool surface = l > 0.5f && l < 2;
     uint32_t i;
     handle->surface = surface;
+    handle->simd = GKD_SIMD_SCALAR; /* find knows better */
     for (i = 0; i < 3; ++i) {
         offset[i] = pivot[i] - position[i];
         handle->normal[i] = surface ? normal[i] : 0;
@@ -655,28 +663,36 @@ GKD_QUERY void gkd_orient_lobes(gkd_handle *handle, const gkd_lobe *lobes, uint3
 /* Pdf, sample */
 
 /* Density (1/sr) of a unit direction: (1 - e) p' + e / (4 pi), and e / (4 pi) below the surface. By differences, since
-   kappa (mean . w - 1) cancels. Relative error 1e-5. [any thread] */
-GKD_QUERY float gkd_pdf(const gkd_handle *handle, const float direction[3])
+   kappa (mean . w - 1) cancels. Relative error 1e-5. */
+GKD_QUERY float gkd_pdf_scalar(const gkd_handle *handle, const float direction[3])
 {
     const float e = handle->uniform, x = direction[0], y = direction[1], z = direction[2];
     float sum[8] = {0, 0, 0, 0, 0, 0, 0, 0}, c;
     uint32_t i, k;
-    bool surface = handle->surface != 0;
+    float mirrored = handle->surface ? 1.0f : 0.0f; /* no branch in the loop: then it is vectors */
     c = gkd_dot(direction, handle->normal);
-    if (surface && !(c > 0))
+    if (handle->surface && !(c > 0))
         return e * (1 / (4 * GKD_PI));
     for (i = 0; i < handle->count; i += 8) {
         const gkd_lobe_block *b = &handle->block[i / 8];
         for (k = 0; k < 8; ++k) {
             float dx = x - b->x[k], dy = y - b->y[k], dz = z - b->z[k];
-            float t = -b->falloff[k] * (dx * dx + dy * dy + dz * dz), p = gkd_exp2(t);
-            if (surface)
-                p += gkd_exp2(t - b->lift[k] * c);
-            sum[k] += b->scale[k] * p;
+            float t = -b->falloff[k] * (dx * dx + dy * dy + dz * dz);
+            sum[k] += b->scale[k] * (gkd_exp2(t) + mirrored * gkd_exp2(t - b->lift[k] * c));
         }
     }
     return (1 - e) * (((sum[0] + sum[4]) + (sum[2] + sum[6])) + ((sum[1] + sum[5]) + (sum[3] + sum[7]))) +
            e * (1 / (4 * GKD_PI));
+}
+
+/* Density (1/sr) of a unit direction, as above, by the SIMD level of the handle. [any thread] */
+GKD_QUERY float gkd_pdf(const gkd_handle *handle, const float direction[3])
+{
+#ifdef GKD_QUERY_SIMD
+    if (handle->simd > GKD_SIMD_SCALAR)
+        return gkd_pdf_one(handle, direction);
+#endif
+    return gkd_pdf_scalar(handle, direction);
 }
 
 /* A draw: what to draw from, and with which numbers. */
@@ -708,7 +724,7 @@ GKD_QUERY void gkd_draw_lobe(const gkd_handle *handle, uint32_t i, float r, floa
     b = &handle->block[i / 8];
     k = i % 8;
     width = b->upper[k] - low;
-    out->r = (r - low + extra) / (width > 1e-9f ? width : 1e-9f);
+    out->r = (r - low + extra) / gkd_most(width, 1e-9f);
     out->mean[0] = b->x[k];
     out->mean[1] = b->y[k];
     out->mean[2] = b->z[k];
@@ -748,7 +764,7 @@ GKD_QUERY void gkd_draw_direction(const gkd_draw *in, float direction[3])
 {
     const float *m = in->mean, *n = in->normal;
     float v = gkd_minus_log1m(gkd_clamp(in->r, 0, 0.99999994f) * gkd_one_minus_exp(2 * in->kappa)) / in->kappa;
-    float s, c, radius, sign = m[2] < 0 ? -1.0f : 1.0f, a = -1 / (sign + m[2]), b = m[0] * m[1] * a;
+    float s, c, radius, sign = copysignf(1, m[2]), a = -1 / (sign + m[2]), b = m[0] * m[1] * a;
     uint32_t k;
     v = v < 2 ? v : 2;
     radius = sqrtf(v * (2 - v));
@@ -760,7 +776,7 @@ GKD_QUERY void gkd_draw_direction(const gkd_draw *in, float direction[3])
     direction[1] = v * m[1] + c * sign * b + s * (sign + m[1] * m[1] * a);
     direction[2] = v * m[2] - c * sign * m[0] - s * m[1];
     a = direction[0] * n[0] + direction[1] * n[1] + direction[2] * n[2];
-    a = a < 0 ? 2 * a : 0;
+    a = 2 * gkd_least(a, 0);
     b = 0;
     for (k = 0; k < 3; ++k) {
         direction[k] -= a * n[k];
@@ -770,14 +786,23 @@ GKD_QUERY void gkd_draw_direction(const gkd_draw *in, float direction[3])
         direction[k] *= 1.5f - 0.5f * b;
 }
 
-/* Draw a direction; returns its density, of the rounded direction, by gkd_pdf. u in [0,1): u[0] chooses the lobe
-   (monotone) and, with what remains of it, the angle to its mean; u[1] the angle around. [any thread] */
-GKD_QUERY float gkd_sample(const gkd_handle *handle, const float u[2], float direction[3])
+GKD_QUERY float gkd_sample_scalar(const gkd_handle *handle, const float u[2], float direction[3])
 {
     gkd_draw draw;
     gkd_choose_lobe(handle, u, &draw);
     gkd_draw_direction(&draw, direction);
-    return gkd_pdf(handle, direction);
+    return gkd_pdf_scalar(handle, direction);
+}
+
+/* Draw a direction; returns its density, of the rounded direction, by gkd_pdf. u in [0,1): u[0] chooses the lobe
+   (monotone) and, with what remains of it, the angle to its mean; u[1] the angle around. [any thread] */
+GKD_QUERY float gkd_sample(const gkd_handle *handle, const float u[2], float direction[3])
+{
+#ifdef GKD_QUERY_SIMD
+    if (handle->simd > GKD_SIMD_SCALAR)
+        return gkd_sample_one(handle, u, direction);
+#endif
+    return gkd_sample_scalar(handle, u, direction);
 }
 
 /* Leaf of the tree at a position. NaN goes up. [any thread] */
@@ -816,18 +841,43 @@ GKD_QUERY uint32_t gkd_find_box(const gkd_view *view, const float position[3], f
     return link & ~GKD_LEAF;
 }
 
+GKD_QUERY void gkd_jitter(const gkd_view *view, const float position[3], const float u[3], float out[3])
+{
+    float low[3], high[3];
+    uint32_t axis;
+    gkd_find_box(view, position, low, high);
+    for (axis = 0; axis < 3; ++axis)
+        out[axis] = position[axis] + (u[axis] - 0.5f) * (high[axis] - low[axis]);
+}
+
 /* The cell of a position; with u, three random numbers in [0,1), that of the position jittered by the size of its cell,
    which blends neighbours. [any thread] */
 GKD_QUERY uint32_t gkd_find_cell_near(const gkd_view *view, const float position[3], const float *u)
 {
-    float low[3], high[3], p[3];
-    uint32_t axis;
+    float p[3];
     if (!u)
         return gkd_find_cell(view, position);
-    gkd_find_box(view, position, low, high);
-    for (axis = 0; axis < 3; ++axis)
-        p[axis] = position[axis] + (u[axis] - 0.5f) * (high[axis] - low[axis]);
+    gkd_jitter(view, position, u, p);
     return gkd_find_cell(view, p);
+}
+
+/* What a view knows of a cell, but for the lobes. */
+GKD_QUERY const gkd_cell *gkd_set_cell(const gkd_view *view, uint32_t index, gkd_handle *handle)
+{
+    const gkd_cell *cell = &view->cells[index];
+    handle->cell = index;
+    handle->alpha = cell->alpha;
+    handle->reflected = cell->reflected;
+    handle->uniform = view->uniform;
+    return cell;
+}
+
+GKD_QUERY void gkd_find_scalar(const gkd_view *view, const float position[3], const float *normal, const float *u,
+                               gkd_handle *handle)
+{
+    const gkd_cell *cell = gkd_set_cell(view, gkd_find_cell_near(view, position, u), handle);
+    gkd_orient_lobes_as(handle, view->lobes + cell->lobes, cell->count, cell->pivot, position, normal,
+                        !view->no_product);
 }
 
 /* Find the cell of a position and its lobes as seen from there. normal (unit, on the side that light comes from) makes
@@ -836,14 +886,13 @@ GKD_QUERY uint32_t gkd_find_cell_near(const gkd_view *view, const float position
 GKD_QUERY void gkd_find(const gkd_view *view, const float position[3], const float *normal, const float *u,
                         gkd_handle *handle)
 {
-    uint32_t index = gkd_find_cell_near(view, position, u);
-    const gkd_cell *cell = &view->cells[index];
-    handle->cell = index;
-    handle->alpha = cell->alpha;
-    handle->reflected = cell->reflected;
-    handle->uniform = view->uniform;
-    gkd_orient_lobes_as(handle, view->lobes + cell->lobes, cell->count, cell->pivot, position, normal,
-                        !view->no_product);
+#ifdef GKD_QUERY_SIMD
+    if (view->simd > GKD_SIMD_SCALAR) {
+        gkd_find_one(view, position, normal, u, handle);
+        return;
+    }
+#endif
+    gkd_find_scalar(view, position, normal, u, handle);
 }
 
 /* A handle is large and mostly unset: copy what is set. [any thread] */
@@ -955,7 +1004,7 @@ GKD_QUERY gkd_training_sample gkd_make_sample(const float position[3], const flo
 
 /* The queries for arrays: several in flight at once, by the SIMD level of the view. index lists the entries to process
    in all arrays (NULL = 0 .. count - 1); strides are in bytes. normals, u and alpha (dense floats) of find may be NULL.
-   Handles are dense. Levels differ from the inline functions by <= 1e-5 relative. [any thread] */
+   Handles are dense. Levels differ from the scalar one by <= 1e-5 relative. [any thread] */
 GKD_API void gkd_find_batch(const gkd_view *view, uint32_t count, const uint32_t *index, const float *positions,
                             size_t position_stride, const float *normals, size_t normal_stride, const float *u,
                             size_t u_stride, gkd_handle *handles, float *alpha);
@@ -3377,8 +3426,8 @@ static float gkdi_sample_pdf(const gkd_view *view, const gkd_training_sample *s,
     gkd_handle handle;
     float normal[3];
     gkd_unpack_normal(s->direction, normal);
-    gkd_find(view, s->position, normal, NULL, &handle);
-    return gkd_pdf(&handle, direction);
+    gkd_find_scalar(view, s->position, normal, NULL, &handle); /* the same bits from all levels */
+    return gkd_pdf_scalar(&handle, direction);
 }
 
 /* A sample's position, within the bounds. */
@@ -4318,7 +4367,6 @@ static float *gkdi_row_out(float *base, size_t stride, uint32_t row)
 #define GKDI_WIDE __attribute__((target("avx2,fma")))
 #define GKDI_OP __attribute__((target("avx2,fma"), always_inline)) static inline
 typedef __m256 gkdi_f;
-typedef __m256i gkdi_n;
 typedef __m256 gkdi_mask;
 GKDI_OP gkdi_f gkdi_v_load(const float *p) { return _mm256_loadu_ps(p); }
 GKDI_OP void gkdi_v_store(float *p, gkdi_f v) { _mm256_storeu_ps(p, v); }
@@ -4337,15 +4385,6 @@ GKDI_OP gkdi_mask gkdi_v_both(gkdi_mask a, gkdi_mask b) { return _mm256_and_ps(a
 GKDI_OP gkdi_f gkdi_v_where(gkdi_mask a, gkdi_f b) { return _mm256_and_ps(a, b); }
 GKDI_OP gkdi_f gkdi_v_pick(gkdi_mask m, gkdi_f a, gkdi_f b) { return _mm256_blendv_ps(b, a, m); }
 GKDI_OP bool gkdi_v_any(gkdi_mask m) { return _mm256_movemask_ps(m) != 0; }
-GKDI_OP gkdi_mask gkdi_v_odd(gkdi_n v) { return _mm256_castsi256_ps(_mm256_slli_epi32(v, 31)); }
-GKDI_OP gkdi_f gkdi_v_negate_two(gkdi_f a, gkdi_n b) /* where b & 2 */
-{
-    __m256i sign = _mm256_slli_epi32(_mm256_and_si256(b, _mm256_set1_epi32(2)), 30);
-    return _mm256_xor_ps(a, _mm256_castsi256_ps(sign));
-}
-GKDI_OP gkdi_n gkdi_v_next(gkdi_n v) { return _mm256_add_epi32(v, _mm256_set1_epi32(1)); }
-GKDI_OP gkdi_f gkdi_v_float(gkdi_n v) { return _mm256_cvtepi32_ps(v); }
-GKDI_OP gkdi_n gkdi_v_truncate(gkdi_f v) { return _mm256_cvttps_epi32(v); }
 GKDI_OP gkdi_f gkdi_v_rsqrt(gkdi_f a) /* relative error 3e-7 */
 {
     gkdi_f r = _mm256_rsqrt_ps(a), h = gkdi_v_mul(gkdi_v_mul(a, r), gkdi_v_all(0.5f));
@@ -4481,9 +4520,6 @@ GKDI_OP gkdi_f gkdi_v_rises(const gkdi_f d[3], const float *n)
 typedef struct gkdi_f {
     float32x4_t a, b;
 } gkdi_f;
-typedef struct gkdi_n {
-    int32x4_t a, b;
-} gkdi_n;
 typedef struct gkdi_mask {
     uint32x4_t a, b;
 } gkdi_mask;
@@ -4546,23 +4582,6 @@ GKDI_HALVES3(gkdi_v_nmadd, GKDI_NMADD4, gkdi_f)
 GKDI_HALVES3(gkdi_v_pick, vbslq_f32, gkdi_mask)
 GKDI_OP gkdi_f gkdi_v_where(gkdi_mask m, gkdi_f x) { return gkdi_v_pick(m, x, gkdi_v_all(0)); }
 GKDI_OP bool gkdi_v_any(gkdi_mask m) { return vmaxvq_u32(vorrq_u32(m.a, m.b)) != 0; }
-#define GKDI_ODD4(x) vtstq_s32(x, vdupq_n_s32(1))
-#define GKDI_NEXT4(x) vaddq_s32(x, vdupq_n_s32(1))
-GKDI_HALVES1(gkdi_mask, gkdi_v_odd, GKDI_ODD4, gkdi_n)
-GKDI_HALVES1(gkdi_n, gkdi_v_next, GKDI_NEXT4, gkdi_n)
-GKDI_HALVES1(gkdi_f, gkdi_v_float, vcvtq_f32_s32, gkdi_n)
-GKDI_HALVES1(gkdi_n, gkdi_v_truncate, vcvtq_s32_f32, gkdi_f)
-GKDI_OP float32x4_t gkdi_v_negate_two4(float32x4_t x, int32x4_t k)
-{
-    int32x4_t sign = vshlq_n_s32(vandq_s32(k, vdupq_n_s32(2)), 30);
-    return vreinterpretq_f32_s32(veorq_s32(vreinterpretq_s32_f32(x), sign));
-}
-GKDI_OP gkdi_f gkdi_v_negate_two(gkdi_f x, gkdi_n k) /* where k & 2 */
-{
-    x.a = gkdi_v_negate_two4(x.a, k.a);
-    x.b = gkdi_v_negate_two4(x.b, k.b);
-    return x;
-}
 GKDI_OP gkdi_f gkdi_v_rsqrt(gkdi_f x) { return gkdi_v_div(gkdi_v_all(1), gkdi_v_sqrt(x)); }
 GKDI_OP float32x4_t gkdi_v_split_exponent4(float32x4_t x, float32x4_t *out)
 {
@@ -4710,6 +4729,8 @@ GKDI_OP float gkdi_pdf_inline(const gkd_handle *handle, const float d[3])
     return (1 - e) * gkdi_v_sum(gkdi_pdf_lanes(handle, d)) + e * (1 / (4 * GKD_PI));
 }
 
+GKDI_WIDE static float gkdi_pdf_wide(const gkd_handle *handle, const float *d) { return gkdi_pdf_inline(handle, d); }
+
 GKDI_WIDE static void gkdi_pdf_batch_wide(uint32_t count, const uint32_t *index, const gkd_handle *handles,
                                           const float *directions, size_t stride, float *pdf)
 {
@@ -4796,7 +4817,39 @@ GKDI_512_OP __m512 gkdi_exp2_512(__m512 t)
     return _mm512_maskz_scalef_ps(0xffff, p, t);
 }
 
-GKDI_512_OP __m512 gkdi_join_512(__m256 a, __m256 b) { return _mm512_insertf32x8(_mm512_castps256_ps512(a), b, 1); }
+/* Sixteen directions as columns; packed ones (stride 12) by two permutations a column. */
+GKDI_512_OP void gkdi_load_directions_512(const float *p, size_t stride, __m512 out[3])
+{
+    const __m512i lanes = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    gkdi_f a[4], b[4];
+    int k;
+    if (stride == 12) {
+        __m512 low = _mm512_loadu_ps(p), middle = _mm512_loadu_ps(p + 16), high = _mm512_loadu_ps(p + 32);
+        for (k = 0; k < 3; ++k) {
+            __m512i at = _mm512_add_epi32(_mm512_mullo_epi32(lanes, _mm512_set1_epi32(3)), _mm512_set1_epi32(k));
+            __mmask16 last = _mm512_cmp_epi32_mask(at, _mm512_set1_epi32(32), _MM_CMPINT_NLT);
+            __m512i then = _mm512_mask_sub_epi32(lanes, last, at, _mm512_set1_epi32(16));
+            out[k] = _mm512_permutex2var_ps(_mm512_permutex2var_ps(low, at, middle), then, high);
+        }
+        return;
+    }
+    gkdi_v_load_directions(p, stride, a);
+    gkdi_v_load_directions(gkdi_row(p, stride, 8), stride, b);
+    for (k = 0; k < 3; ++k)
+        out[k] = _mm512_insertf32x8(_mm512_castps256_ps512(a[k]), b[k], 1);
+}
+
+/* gkdi_v_rises. */
+GKDI_512_OP __m512 gkdi_rises_512(const __m512 d[3], const float *n)
+{
+    __m256 half[2][3];
+    int k;
+    for (k = 0; k < 3; ++k) {
+        half[0][k] = _mm512_castps512_ps256(d[k]);
+        half[1][k] = _mm512_extractf32x8_ps(d[k], 1);
+    }
+    return _mm512_insertf32x8(_mm512_castps256_ps512(gkdi_v_rises(half[0], n)), gkdi_v_rises(half[1], n), 1);
+}
 
 /* gkdi_pdf_sphere or, with a surface, gkdi_pdf_above. */
 GKDI_512_OP __m512 gkdi_pdf_sum_512(const gkd_handle *handle, const __m512 d[3], __m512 c, __m512 least, bool surface)
@@ -4828,17 +4881,13 @@ GKDI_512 static void gkdi_pdf_same_512(const gkd_handle *handle, uint32_t count,
                                        float *pdf)
 {
     const float e = handle->uniform;
-    uint32_t i, k;
+    uint32_t i;
     for (i = 0; i < count; i += 16) {
-        gkdi_f a[4], b[4];
         __m512 d[3], sum, c = _mm512_setzero_ps();
         __mmask16 above;
-        gkdi_v_load_directions(gkdi_row(directions, stride, i), stride, a);
-        gkdi_v_load_directions(gkdi_row(directions, stride, i + 8), stride, b);
-        for (k = 0; k < 3; ++k)
-            d[k] = gkdi_join_512(a[k], b[k]);
+        gkdi_load_directions_512(gkdi_row(directions, stride, i), stride, d);
         if (handle->surface) {
-            c = gkdi_join_512(gkdi_v_rises(a, handle->normal), gkdi_v_rises(b, handle->normal));
+            c = gkdi_rises_512(d, handle->normal);
             above = _mm512_cmp_ps_mask(c, _mm512_setzero_ps(), _CMP_GT_OQ);
             sum = gkdi_pdf_sum_512(handle, d, c, _mm512_mask_blend_ps(above, _mm512_set1_ps(2), c), true);
             sum = _mm512_maskz_mov_ps(above, sum);
@@ -4965,71 +5014,75 @@ GKDI_OP void gkdi_tilt_lobes(gkd_lobe_block *b, const float *normal)
     gkdi_v_store(b->lift, gkdi_v_mul(gkdi_v_mul(k, gkdi_v_all(2 * GKD_LOG2E)), gkdi_v_max(r, gkdi_v_all(0))));
 }
 
-/* Scale, sums of weights, falloff. */
-GKDI_OP void gkdi_finish_lobes(gkd_handle *handle, bool product)
+/* Up to eight lobes of a handle. Handles have few lobes, but how few cannot be predicted: so steps go over all parts of
+   a group. */
+typedef struct gkdi_part {
+    gkd_lobe_block *block;
+    const gkd_lobe *lobes;
+    uint32_t of, left; /* handle; lobes from here on */
+} gkdi_part;
+
+/* Scale, sums of weights, falloff. inverse: of the handle's sum; before: sum of the parts before, adds this one's. */
+GKDI_OP void gkdi_finish_lobes(gkd_lobe_block *b, uint32_t left, float inverse, float *before)
 {
-    uint32_t i, count = handle->count, blocks = (count + 7) / 8;
-    gkdi_f total = gkdi_v_all(0);
-    float sum;
-    for (i = 0; i < blocks; ++i)
-        total = gkdi_v_add(total, gkdi_v_load(handle->block[i].upper));
-    sum = gkdi_v_sum(total);
-    if (!(sum > GKD_DIM)) {
-        gkd_set_plain(handle, product);
-        gkd_finish_lobes(handle, 1);
-        return;
-    }
-    total = gkdi_v_all(1 / sum);
-    sum = 0;
-    for (i = 0; i < blocks; ++i) {
-        gkd_lobe_block *b = &handle->block[i];
-        gkdi_f k = gkdi_v_load(b->falloff), w = gkdi_v_mul(gkdi_v_load(b->upper), total), m, upper;
-        m = gkdi_v_mul(gkdi_v_all(2 * GKD_PI), gkdi_one_minus_exp(gkdi_v_add(k, k)));
-        gkdi_v_store(b->scale, gkdi_v_div(gkdi_v_mul(w, k), m));
-        gkdi_v_store(b->falloff, gkdi_v_mul(k, gkdi_v_all(0.5f * GKD_LOG2E)));
-        upper = gkdi_v_add(gkdi_v_prefix(w), gkdi_v_all(sum));
-        if (i + 1 < blocks)
-            sum += gkdi_v_sum(w);
-        else
-            upper = gkdi_v_pick(gkdi_v_lanes_from(count - 1 - i * 8), gkdi_v_all(1), upper);
-        gkdi_v_store(b->upper, upper);
-    }
+    gkdi_f k = gkdi_v_load(b->falloff), w = gkdi_v_mul(gkdi_v_load(b->upper), gkdi_v_all(inverse)), m, upper;
+    m = gkdi_v_mul(gkdi_v_all(2 * GKD_PI), gkdi_one_minus_exp(gkdi_v_add(k, k)));
+    gkdi_v_store(b->scale, gkdi_v_div(gkdi_v_mul(w, k), m));
+    gkdi_v_store(b->falloff, gkdi_v_mul(k, gkdi_v_all(0.5f * GKD_LOG2E)));
+    upper = gkdi_v_add(gkdi_v_prefix(w), gkdi_v_all(*before));
+    gkdi_v_store(b->upper, gkdi_v_pick(gkdi_v_lanes_from(left - 1), gkdi_v_all(1), upper));
+    *before += gkdi_v_sum(w);
 }
 
 /* gkd_orient_lobes_as of up to GKDI_GROUP handles. */
 GKDI_WIDE static void gkdi_orient_wide(uint32_t count, const gkdi_view_from *from, bool product)
 {
-    float offset[GKDI_GROUP][3];
+    float offset[GKDI_GROUP][3], sum[GKDI_GROUP], inverse[GKDI_GROUP], before[GKDI_GROUP];
     bool surface[GKDI_GROUP];
-    uint32_t i, k;
+    gkdi_part part[GKDI_GROUP * GKD_MAX_LOBES / 8];
+    uint32_t i, k, n = 0;
     for (i = 0; i < count; ++i) {
-        surface[i] = gkd_place_handle(from[i].handle, from[i].pivot, from[i].position, from[i].normal, offset[i]);
-        from[i].handle->count = from[i].count;
-        for (k = 0; k < from[i].count; k += 2) /* 48 bytes */
-            __builtin_prefetch(from[i].lobes + k);
+        gkd_handle *h = from[i].handle;
+        surface[i] = gkd_place_handle(h, from[i].pivot, from[i].position, from[i].normal, offset[i]);
+        h->count = from[i].count;
+        sum[i] = before[i] = 0;
+        for (k = 0; k < h->count; k += 8, ++n) {
+            part[n].block = &h->block[k / 8];
+            part[n].lobes = from[i].lobes + k;
+            part[n].of = i;
+            part[n].left = h->count - k;
+            __builtin_prefetch(part[n].lobes);
+            __builtin_prefetch((const char *)part[n].lobes + 64);
+            __builtin_prefetch((const char *)part[n].lobes + 128);
+        }
+    }
+    for (k = 0; k < n; ++k)
+        gkdi_turn_lobes(part[k].block, part[k].lobes, part[k].left, offset[part[k].of]);
+    for (k = 0; k < n; ++k)
+        if (surface[part[k].of])
+            gkdi_weigh_lobes(part[k].block, from[part[k].of].handle->normal, product);
+        else
+            gkdi_v_store(part[k].block->lift, gkdi_v_all(0));
+    for (k = 0; k < n; ++k) {
+        if (surface[part[k].of])
+            gkdi_tilt_lobes(part[k].block, from[part[k].of].handle->normal);
+        sum[part[k].of] += gkdi_v_sum(gkdi_v_load(part[k].block->upper));
     }
     for (i = 0; i < count; ++i)
-        for (k = 0; k < from[i].count; k += 8)
-            gkdi_turn_lobes(&from[i].handle->block[k / 8], from[i].lobes + k, from[i].count - k, offset[i]);
+        inverse[i] = 1 / sum[i];
+    for (k = 0; k < n; ++k)
+        gkdi_finish_lobes(part[k].block, part[k].left, inverse[part[k].of], &before[part[k].of]);
     for (i = 0; i < count; ++i)
-        for (k = 0; surface[i] && k < from[i].count; k += 8)
-            gkdi_weigh_lobes(&from[i].handle->block[k / 8], from[i].handle->normal, product);
-    for (i = 0; i < count; ++i)
-        for (k = 0; k < from[i].count; k += 8) {
-            if (surface[i])
-                gkdi_tilt_lobes(&from[i].handle->block[k / 8], from[i].handle->normal);
-            else
-                gkdi_v_store(from[i].handle->block[k / 8].lift, gkdi_v_all(0));
+        if (!(sum[i] > GKD_DIM)) {
+            gkd_set_plain(from[i].handle, product);
+            gkd_finish_lobes(from[i].handle, 1);
         }
-    for (i = 0; i < count; ++i)
-        gkdi_finish_lobes(from[i].handle, product);
 }
 
 /* Columns of draws. */
 #define GKDI_DRAWS 64
 typedef struct gkdi_draws {
     float mean[3][GKDI_DRAWS], kappa[GKDI_DRAWS], normal[3][GKDI_DRAWS], r[GKDI_DRAWS], turn[GKDI_DRAWS];
-    float out[3][GKDI_DRAWS];
 } gkdi_draws;
 
 /* gkd_minus_log1m. */
@@ -5047,44 +5100,31 @@ GKDI_OP gkdi_f gkdi_minus_log1m(gkdi_f y)
     return gkdi_v_nmadd(exponent, gkdi_v_all(GKD_LN2), gkdi_v_sub(zero, p));
 }
 
-/* gkd_circle. */
-GKDI_OP void gkdi_circle(gkdi_f u, gkdi_f *sine, gkdi_f *cosine)
+/* gkd_sine. */
+GKDI_OP gkdi_f gkdi_sine(gkdi_f x)
 {
-    gkdi_f f = gkdi_v_mul(u, gkdi_v_all(4)), x, s, c, q;
-    gkdi_n k = gkdi_v_truncate(gkdi_v_add(f, gkdi_v_all(0.5f)));
-    gkdi_mask odd = gkdi_v_odd(k);
-    x = gkdi_v_mul(gkdi_v_sub(f, gkdi_v_float(k)), gkdi_v_all(GKD_PI / 2));
-    q = gkdi_v_mul(x, x);
-    s = gkdi_v_madd(q, gkdi_v_all(-1.0f / 5040), gkdi_v_all(1.0f / 120));
-    s = gkdi_v_madd(q, s, gkdi_v_all(-1.0f / 6));
-    s = gkdi_v_mul(x, gkdi_v_madd(q, s, gkdi_v_all(1)));
-    c = gkdi_v_madd(q, gkdi_v_all(1.0f / 40320), gkdi_v_all(-1.0f / 720));
-    c = gkdi_v_madd(q, c, gkdi_v_all(1.0f / 24));
-    c = gkdi_v_madd(q, c, gkdi_v_all(-1.0f / 2));
-    c = gkdi_v_madd(q, c, gkdi_v_all(1));
-    *sine = gkdi_v_negate_two(gkdi_v_pick(odd, c, s), k);
-    *cosine = gkdi_v_negate_two(gkdi_v_pick(odd, s, c), gkdi_v_next(k));
+    gkdi_f q = gkdi_v_mul(x, x), p = gkdi_v_madd(q, gkdi_v_all(39.536707f), gkdi_v_all(-76.549782f));
+    p = gkdi_v_madd(q, p, gkdi_v_all(81.601004f));
+    p = gkdi_v_madd(q, p, gkdi_v_all(-41.341655f));
+    return gkdi_v_mul(x, gkdi_v_madd(q, p, gkdi_v_all(6.2831852f)));
 }
 
-/* gkd_draw_direction of eight draws from lane i on. */
-GKDI_WIDE static void gkdi_draw_directions(gkdi_draws *d, uint32_t i)
+/* gkd_draw_direction of eight draws: in m means, out directions; n normals. */
+GKDI_OP void gkdi_draw_directions(gkdi_f m[3], const gkdi_f n[3], gkdi_f k, gkdi_f r, gkdi_f turn)
 {
-    gkdi_f m[3], n[3], w[3], one = gkdi_v_all(1), zero = gkdi_v_all(0), v, s, c, radius, sign, a, b, k;
+    gkdi_f w[3], one = gkdi_v_all(1), zero = gkdi_v_all(0), v, s, c, radius, sign, a, b;
     uint32_t j;
-    for (j = 0; j < 3; ++j) {
-        m[j] = gkdi_v_load(d->mean[j] + i);
-        n[j] = gkdi_v_load(d->normal[j] + i);
-    }
-    k = gkdi_v_load(d->kappa + i);
-    v = gkdi_v_mul(gkdi_v_bound(gkdi_v_load(d->r + i), 0, 0.99999994f), gkdi_one_minus_exp(gkdi_v_add(k, k)));
+    v = gkdi_v_mul(gkdi_v_bound(r, 0, 0.99999994f), gkdi_one_minus_exp(gkdi_v_add(k, k)));
     v = gkdi_v_bound(gkdi_v_div(gkdi_minus_log1m(v), k), 0, 2);
     sign = gkdi_v_pick(gkdi_v_less(m[2], zero), gkdi_v_all(-1), one);
     a = gkdi_v_div(gkdi_v_all(-1), gkdi_v_add(sign, m[2]));
-    b = gkdi_v_mul(gkdi_v_mul(m[0], m[1]), a);
     radius = gkdi_v_sqrt(gkdi_v_mul(v, gkdi_v_sub(gkdi_v_all(2), v)));
-    gkdi_circle(gkdi_v_load(d->turn + i), &s, &c);
-    s = gkdi_v_mul(s, radius);
-    c = gkdi_v_mul(c, radius);
+    c = gkdi_v_all(0.5f); /* gkd_circle */
+    s = gkdi_v_sub(c, turn);
+    b = gkdi_v_max(gkdi_v_min(s, gkdi_v_sub(c, s)), gkdi_v_sub(gkdi_v_sub(zero, c), s));
+    c = gkdi_v_mul(gkdi_sine(gkdi_v_sub(gkdi_v_abs(s), gkdi_v_all(0.25f))), radius);
+    s = gkdi_v_mul(gkdi_sine(b), radius);
+    b = gkdi_v_mul(gkdi_v_mul(m[0], m[1]), a);
     v = gkdi_v_sub(one, v);
     w[0] = gkdi_v_madd(gkdi_v_mul(gkdi_v_mul(m[0], m[0]), a), sign, one);
     w[0] = gkdi_v_madd(v, m[0], gkdi_v_madd(c, w[0], gkdi_v_mul(s, b)));
@@ -5097,29 +5137,41 @@ GKDI_WIDE static void gkdi_draw_directions(gkdi_draws *d, uint32_t i)
         w[j] = gkdi_v_nmadd(a, n[j], w[j]);
     b = gkdi_v_nmadd(gkdi_v_all(0.5f), gkdi_v_dot(w[0], w[1], w[2], w[0], w[1], w[2]), gkdi_v_all(1.5f));
     for (j = 0; j < 3; ++j)
-        gkdi_v_store(d->out[j] + i, gkdi_v_mul(w[j], b));
+        m[j] = gkdi_v_mul(w[j], b);
 }
 
-/* gkd_choose_lobe, into column i. */
-GKDI_OP void gkdi_choose_lobe(const gkd_handle *handle, const float *u, gkdi_draws *d, uint32_t i)
+/* gkd_choose_lobe. */
+GKDI_OP void gkdi_choose_lobe(const gkd_handle *handle, const float *u, gkd_draw *out)
 {
     float e = handle->uniform, extra = gkd_extend_random(u), r = (u[0] - e) / (1 - e);
     uint32_t k, n = 0, blocks = (handle->count + 7) / 8;
+    out->turn = u[1];
+    if (u[0] < e) {
+        gkd_draw_uniform(u[0], extra, e, out);
+        return;
+    }
+    for (k = 0; k < blocks; ++k)
+        n += gkdi_v_count_at_most(gkdi_v_load(handle->block[k].upper), r);
+    gkd_draw_lobe(handle, n, r, extra / (1 - e), out);
+}
+
+GKDI_WIDE static float gkdi_sample_wide(const gkd_handle *handle, const float *u, float *direction)
+{
     gkd_draw draw;
-    if (u[0] < e)
-        gkd_draw_uniform(u[0], extra, e, &draw);
-    else {
-        for (k = 0; k < blocks; ++k)
-            n += gkdi_v_count_at_most(gkdi_v_load(handle->block[k].upper), r);
-        gkd_draw_lobe(handle, n, r, extra / (1 - e), &draw);
-    }
+    gkdi_f m[3], n[3];
+    float lanes[8];
+    uint32_t k;
+    gkdi_choose_lobe(handle, u, &draw);
     for (k = 0; k < 3; ++k) {
-        d->mean[k][i] = draw.mean[k];
-        d->normal[k][i] = draw.normal[k];
+        m[k] = gkdi_v_all(draw.mean[k]);
+        n[k] = gkdi_v_all(draw.normal[k]);
     }
-    d->kappa[i] = draw.kappa;
-    d->r[i] = draw.r;
-    d->turn[i] = u[1];
+    gkdi_draw_directions(m, n, gkdi_v_all(draw.kappa), gkdi_v_all(draw.r), gkdi_v_all(draw.turn));
+    for (k = 0; k < 3; ++k) {
+        gkdi_v_store(lanes, m[k]);
+        direction[k] = lanes[0];
+    }
+    return gkdi_pdf_inline(handle, direction);
 }
 
 GKDI_WIDE static void gkdi_sample_batch_wide(uint32_t count, const uint32_t *index, const gkd_handle *handles,
@@ -5135,15 +5187,32 @@ GKDI_WIDE static void gkdi_sample_batch_wide(uint32_t count, const uint32_t *ind
         n = count - start < GKDI_DRAWS ? count - start : GKDI_DRAWS;
         for (i = 0; i < n; ++i) {
             uint32_t at = gkdi_at(index, start + i);
-            gkdi_choose_lobe(&handles[at], gkdi_row(u, u_stride, at), &draws, i);
+            gkd_draw draw;
+            gkdi_choose_lobe(&handles[at], gkdi_row(u, u_stride, at), &draw);
+            for (k = 0; k < 3; ++k) {
+                draws.mean[k][i] = draw.mean[k];
+                draws.normal[k][i] = draw.normal[k];
+            }
+            draws.kappa[i] = draw.kappa;
+            draws.r[i] = draw.r;
+            draws.turn[i] = draw.turn;
         }
-        for (i = 0; i < n; i += 8)
-            gkdi_draw_directions(&draws, i);
+        for (i = 0; i < n; i += 8) {
+            gkdi_f m[3], normal[3];
+            for (k = 0; k < 3; ++k) {
+                m[k] = gkdi_v_load(draws.mean[k] + i);
+                normal[k] = gkdi_v_load(draws.normal[k] + i);
+            }
+            gkdi_draw_directions(m, normal, gkdi_v_load(draws.kappa + i), gkdi_v_load(draws.r + i),
+                                 gkdi_v_load(draws.turn + i));
+            for (k = 0; k < 3; ++k)
+                gkdi_v_store(draws.mean[k] + i, m[k]);
+        }
         for (i = 0; i < n; ++i) {
             uint32_t at = gkdi_at(index, start + i);
             float *out = gkdi_row_out(directions, stride, at), d[3];
             for (k = 0; k < 3; ++k)
-                out[k] = d[k] = draws.out[k][i];
+                out[k] = d[k] = draws.mean[k][i];
             pdf[at] = gkdi_pdf_inline(&handles[at], d);
         }
     }
@@ -5157,6 +5226,8 @@ static void gkdi_orient_group(uint32_t simd, uint32_t count, const gkdi_view_fro
 #if GKDI_X86 || GKDI_NEON
     if (simd > GKD_SIMD_SCALAR) {
         gkdi_orient_wide(count, from, product);
+        for (i = 0; i < count; ++i)
+            from[i].handle->simd = simd;
         return;
     }
 #endif
@@ -5179,7 +5250,7 @@ GKD_API void gkd_pdf_batch(const gkd_view *view, uint32_t count, const uint32_t 
     (void)view;
     for (i = 0; i < count; ++i) {
         uint32_t at = gkdi_at(index, i);
-        pdf[at] = gkd_pdf(&handles[at], gkdi_row(directions, stride, at));
+        pdf[at] = gkd_pdf_scalar(&handles[at], gkdi_row(directions, stride, at));
     }
 }
 
@@ -5203,7 +5274,7 @@ GKD_API void gkd_pdf_directions(const gkd_view *view, const gkd_handle *handle, 
 #endif
     (void)view;
     for (; i < count; ++i)
-        pdf[i] = gkd_pdf(handle, gkdi_row(directions, stride, i));
+        pdf[i] = gkd_pdf_scalar(handle, gkdi_row(directions, stride, i));
 }
 
 GKD_API void gkd_sample_batch(const gkd_view *view, uint32_t count, const uint32_t *index, const gkd_handle *handles,
@@ -5219,8 +5290,31 @@ GKD_API void gkd_sample_batch(const gkd_view *view, uint32_t count, const uint32
     (void)view;
     for (i = 0; i < count; ++i) {
         uint32_t at = gkdi_at(index, i);
-        pdf[at] = gkd_sample(&handles[at], gkdi_row(u, u_stride, at), gkdi_row_out(directions, stride, at));
+        pdf[at] = gkd_sample_scalar(&handles[at], gkdi_row(u, u_stride, at), gkdi_row_out(directions, stride, at));
     }
+}
+
+/* gkd_find_cell of up to GKDI_GROUP positions, level by level: how deep a leaf lies cannot be predicted. */
+static void gkdi_find_cells(const gkd_view *view, uint32_t count, const float *const *positions, uint32_t *cells)
+{
+    const gkd_node *nodes = view->nodes;
+    uint32_t at[GKDI_GROUP], k, more = 1;
+    if (count == 1) {
+        cells[0] = gkd_find_cell(view, positions[0]);
+        return;
+    }
+    memset(at, 0, sizeof at);
+    while (more) {
+        more = 0;
+        for (k = 0; k < count; ++k) {
+            uint32_t link = nodes[at[k]].link;
+            uint32_t next = (link & 0x1fffffffu) + !(positions[k][link >> 29 & 3] < nodes[at[k]].split);
+            at[k] = link & GKD_LEAF ? at[k] : next;
+            more |= ~link & GKD_LEAF;
+        }
+    }
+    for (k = 0; k < count; ++k)
+        cells[k] = nodes[at[k]].link & ~GKD_LEAF;
 }
 
 GKD_API void gkd_find_batch(const gkd_view *view, uint32_t count, const uint32_t *index, const float *positions,
@@ -5228,19 +5322,24 @@ GKD_API void gkd_find_batch(const gkd_view *view, uint32_t count, const uint32_t
                             size_t u_stride, gkd_handle *handles, float *alpha)
 {
     gkdi_view_from from[GKDI_GROUP];
-    uint32_t done, k;
+    const float *at[GKDI_GROUP];
+    float jittered[GKDI_GROUP][3];
+    uint32_t cells[GKDI_GROUP], done, k;
     for (done = 0; done < count; done += GKDI_GROUP) {
         uint32_t n = count - done < GKDI_GROUP ? count - done : GKDI_GROUP;
         for (k = 0; k < n; ++k) {
-            uint32_t i = gkdi_at(index, done + k), c;
+            uint32_t i = gkdi_at(index, done + k);
+            at[k] = gkdi_row(positions, position_stride, i);
+            if (u) {
+                gkd_jitter(view, at[k], gkdi_row(u, u_stride, i), jittered[k]);
+                at[k] = jittered[k];
+            }
+        }
+        gkdi_find_cells(view, n, at, cells);
+        for (k = 0; k < n; ++k) {
+            uint32_t i = gkdi_at(index, done + k);
             const float *position = gkdi_row(positions, position_stride, i);
-            const gkd_cell *cell;
-            c = gkd_find_cell_near(view, position, u ? gkdi_row(u, u_stride, i) : NULL);
-            cell = &view->cells[c];
-            handles[i].cell = c;
-            handles[i].alpha = cell->alpha;
-            handles[i].reflected = cell->reflected;
-            handles[i].uniform = view->uniform;
+            const gkd_cell *cell = gkd_set_cell(view, cells[k], &handles[i]);
             if (alpha)
                 alpha[i] = cell->alpha;
             from[k].handle = &handles[i];
@@ -5252,6 +5351,30 @@ GKD_API void gkd_find_batch(const gkd_view *view, uint32_t count, const uint32_t
         }
         gkdi_orient_group(view->simd, n, from, !view->no_product);
     }
+}
+
+GKD_API void gkd_find_one(const gkd_view *view, const float position[3], const float *normal, const float *u,
+                          gkd_handle *handle)
+{
+    gkd_find_batch(view, 1, NULL, position, 0, normal, 0, u, 0, handle, NULL);
+}
+
+GKD_API float gkd_sample_one(const gkd_handle *handle, const float u[2], float direction[3])
+{
+#if GKDI_X86 || GKDI_NEON
+    if (handle->simd > GKD_SIMD_SCALAR)
+        return gkdi_sample_wide(handle, u, direction);
+#endif
+    return gkd_sample_scalar(handle, u, direction);
+}
+
+GKD_API float gkd_pdf_one(const gkd_handle *handle, const float direction[3])
+{
+#if GKDI_X86 || GKDI_NEON
+    if (handle->simd > GKD_SIMD_SCALAR)
+        return gkdi_pdf_wide(handle, direction);
+#endif
+    return gkd_pdf_scalar(handle, direction);
 }
 
 /* ---- >>files ------------------------------------------------------------------------------------------------ */
