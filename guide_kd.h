@@ -1061,6 +1061,12 @@ GKD_API void gkd_pdf_directions(const gkd_view *view, const gkd_handle *handle, 
 #pragma GCC optimize("fp-contract=off")
 #endif
 
+#if defined(__GNUC__) || defined(__clang__)
+#define GKDI_PREFETCH(p) __builtin_prefetch(p)
+#else
+#define GKDI_PREFETCH(p) ((void)(p))
+#endif
+
 #define GKDI_GATE_LOW 4        /* values of a below 1 at which V(a) is estimated */
 #define GKDI_MAX_VALUE 9.9e29f /* radiance or weight from here on is a bad sample */
 #define GKDI_MAX_ROOT 1e15     /* contributions are clamped to this before squaring */
@@ -1079,6 +1085,8 @@ GKD_API void gkd_pdf_directions(const gkd_view *view, const gkd_handle *handle, 
 #define GKDI_MAX_LOOK 255         /* nodes of a cell's lookahead tree: 2^(7 + 1) - 1 */
 #define GKDI_MAX_CELLS (1u << 26)
 #define GKDI_NONE 0xffffffffu
+#define GKDI_AHEAD 16       /* samples in the order of cells lie anywhere: so many are on their way */
+#define GKDI_GROUP 16       /* positions looked up, handles oriented together */
 #define GKDI_PACKED_COUNT 3 /* word of a packed mixture that holds the number of lobes */
 
 /* ---- >>memory ----------------------------------------------------------------------------------------------- */
@@ -1163,16 +1171,28 @@ typedef struct gkdi_shape {
 /* x >= 0 as f32, at most 3e38. */
 static float gkdi_float_of(double x) { return x < 3e38 ? (float)x : 3e38f; }
 
-/* One sample. value = L >= 0, finite; of zeros, neither position nor direction is read. */
-static void gkdi_signature_add(gkd_signature *s, const float position[3], const float *direction, float value)
+/* Light of one sample: all but its position. value = L >= 0, finite; of zeros, direction is not read. */
+static void gkdi_signature_light(gkd_signature *s, const float *direction, float value)
 {
-    double v = (double)value, n, gain, window;
+    double v = (double)value;
     uint32_t k;
     s->samples += 1;
     if (!(value > 0))
         return;
     s->sum += v;
     s->squares += v * v;
+    for (k = 0; k < 3; ++k)
+        s->direction[k] += v * (double)direction[k];
+}
+
+/* One sample; of zeros, the position is not read. */
+static void gkdi_signature_add(gkd_signature *s, const float position[3], const float *direction, float value)
+{
+    double n, gain, window;
+    uint32_t k;
+    gkdi_signature_light(s, direction, value);
+    if (!(value > 0))
+        return;
     if (s->lit < GKDI_LIT_MAX)
         s->lit += 1;
     n = (double)s->lit;
@@ -1180,7 +1200,6 @@ static void gkdi_signature_add(gkd_signature *s, const float position[3], const 
     window = n < GKDI_VARIANCE_WINDOW ? gain : 1.0 / GKDI_VARIANCE_WINDOW;
     for (k = 0; k < 3; ++k) {
         double away = (double)position[k] - s->mean[k], spread = (double)s->variance[k];
-        s->direction[k] += v * (double)direction[k];
         s->mean[k] += away * gain;
         spread += (away * ((double)position[k] - s->mean[k]) - spread) * window;
         s->variance[k] = gkdi_float_of(spread);
@@ -1197,6 +1216,38 @@ static void gkdi_shape_add(gkdi_shape *s, const float direction[3], float value)
     s->s[3] += x * y;
     s->s[4] += x * z;
     s->s[5] += y * z;
+}
+
+/* Many non-zero samples, in registers; positions count as if they had come one by one. */
+static void gkdi_signature_add_all(gkd_signature *s, gkdi_shape *shape, const gkdi_item *items, uint32_t count)
+{
+    gkd_signature t = *s;
+    gkdi_shape h = *shape;
+    double far[3] = {0, 0, 0}, square[3] = {0, 0, 0}, from[3], m = (double)count, old = (double)t.lit, n;
+    uint32_t i, k;
+    if (!count)
+        return;
+    for (k = 0; k < 3; ++k)
+        from[k] = t.lit > 0 ? t.mean[k] : (double)items[0].position[k];
+    for (i = 0; i < count; ++i) {
+        gkdi_signature_light(&t, items[i].direction, items[i].weight);
+        gkdi_shape_add(&h, items[i].direction, items[i].weight);
+        for (k = 0; k < 3; ++k) {
+            double away = (double)items[i].position[k] - from[k];
+            far[k] += away;
+            square[k] += away * away;
+        }
+    }
+    t.lit = gkd_least(t.lit + (float)count, GKDI_LIT_MAX);
+    n = fmin(old, GKDI_VARIANCE_WINDOW) + m;
+    for (k = 0; k < 3; ++k) {
+        double mean = far[k] / m, spread = square[k] - far[k] * mean;
+        t.mean[k] = from[k] + far[k] / fmax((double)t.lit, m);
+        spread = (spread > 0 ? spread : 0) + (n - m) * ((double)t.variance[k] + mean * mean * m / n);
+        t.variance[k] = gkdi_float_of(spread / n);
+    }
+    *s = t;
+    *shape = h;
 }
 
 /* Let what was seen so far count for `factor` of its samples [Zheng 2025, section 7.2]. All signatures that are
@@ -3104,6 +3155,7 @@ typedef struct gkdi_update {
     uint32_t count;
     uint32_t *cell_of; /* [count], GKDI_NONE = refused */
     uint32_t *order;   /* samples by cell, each cell's in the order they came */
+    uint32_t kept;     /* how many those are */
     gkdi_outcome *outcomes;
     uint32_t outcome_count;
 } gkdi_update;
@@ -3156,47 +3208,53 @@ static uint32_t gkdi_look_room(const gkd_desc *desc, uint32_t count)
     return n < most ? n : most;
 }
 
-/* Add one sample to the cell and the lookahead cells in which it lies. Where the last of them has enough samples and
-   levels and room are left, it is divided: later samples go on below. */
-static void gkdi_look_add(const gkd_desc *desc, gkdi_cell *c, const float position[3], const float *direction,
-                          float value)
+/* Add one sample to a lookahead cell, or the cell itself, and those below in which it lies. Where the last of them has
+   enough samples and levels and room are left, it is divided: later samples go on below, and where positions lie counts
+   there only. */
+static void gkdi_look_add(const gkd_desc *desc, gkdi_cell *c, uint32_t node, const float position[3],
+                          const float *direction, float value)
 {
-    uint32_t node = 0, level = 0, levels = gkdi_look_levels(desc);
-    for (;;) {
+    uint32_t level = node ? 1 : 0, levels = gkdi_look_levels(desc);
+    for (; c->look[node].child; ++level) {
         gkd_signature *s = &c->look[node];
-        gkdi_signature_add(s, position, direction, value);
-        if (s->child) {
-            node = (uint32_t)s->child + !(position[s->axis] < s->split);
-            ++level;
-            continue;
+        gkdi_signature_light(s, direction, value);
+        node = (uint32_t)s->child + !(position[s->axis] < s->split);
+    }
+    gkdi_signature_add(&c->look[node], position, direction, value);
+    if (level < levels && c->look_count + 2 <= c->look_capacity &&
+        gkdi_signature_count(&c->look[node]) >= (double)desc->min_samples) {
+        uint32_t axis;
+        float split;
+        if (gkdi_signature_split_axis(&c->look[node], &axis, &split)) {
+            gkd_signature *s = &c->look[node];
+            s->axis = (uint8_t)axis;
+            s->split = split;
+            s->child = (uint16_t)c->look_count;
+            memset(&c->look[c->look_count], 0, 2 * sizeof *c->look);
+            c->look_count += 2;
         }
-        if (level < levels && c->look_count + 2 <= c->look_capacity &&
-            gkdi_signature_count(s) >= (double)desc->min_samples) {
-            uint32_t axis;
-            float split;
-            if (gkdi_signature_split_axis(s, &axis, &split)) {
-                s->axis = (uint8_t)axis;
-                s->split = split;
-                s->child = (uint16_t)c->look_count;
-                memset(&c->look[c->look_count], 0, 2 * sizeof *c->look);
-                c->look_count += 2;
-            }
-        }
-        return;
     }
 }
 
-/* Add a range of a batch to a cell. */
+/* Add a range of a batch to a cell. While the cell itself may yet be divided, one by one. */
 static void gkdi_feed(const gkd_desc *desc, gkdi_cell *c, const gkdi_cell_samples *batch, const uint32_t range[4])
 {
     static const float none[3] = {0, 0, 1};
+    bool divides = gkdi_look_levels(desc) > 0;
     uint32_t i;
-    for (i = range[0]; i < range[1]; ++i) {
-        gkdi_look_add(desc, c, batch->items[i].position, batch->items[i].direction, batch->items[i].weight);
+    for (i = range[0]; i < range[1] && divides && !c->look[0].child; ++i) {
+        gkdi_look_add(desc, c, 0, batch->items[i].position, batch->items[i].direction, batch->items[i].weight);
         gkdi_shape_add(&c->shape, batch->items[i].direction, batch->items[i].weight);
     }
+    gkdi_signature_add_all(&c->look[0], &c->shape, batch->items + i, range[1] - i);
+    for (; i < range[1] && divides; ++i) {
+        const gkd_signature *s = &c->look[0];
+        const gkdi_item *p = &batch->items[i];
+        gkdi_look_add(desc, c, (uint32_t)s->child + !(p->position[s->axis] < s->split), p->position, p->direction,
+                      p->weight);
+    }
     for (i = range[2]; i < range[3]; ++i)
-        gkdi_look_add(desc, c, batch->zeros[i], none, 0);
+        gkdi_look_add(desc, c, 0, batch->zeros[i], none, 0);
     c->lit += range[1] - range[0];
 }
 
@@ -3450,9 +3508,12 @@ static void gkdi_take_samples(const gkdi_update *u, const gkdi_outcome *o, gkdi_
     uint32_t i, items = 0, zeros = 0;
     for (i = o->first; i < o->end; ++i) {
         const gkd_training_sample *s = &u->samples[u->order[i]];
+        const gkd_training_sample *soon = &u->samples[u->order[i + GKDI_AHEAD < u->kept ? i + GKDI_AHEAD : i]];
         bool rejected = s->radiance == 0 && signbit(s->radiance);
         double p = (double)s->pdf_mix, pg = (double)s->pdf_guide, g = rejected ? 0 : (double)s->contribution;
         float direction[3], position[3];
+        GKDI_PREFETCH(soon);
+        GKDI_PREFETCH(&soon->pdf_guide); /* may be on the next cache line */
         gkdi_place(desc, s, position);
         gkd_unpack_direction(s->direction, direction);
         c->gate.fresh += 1;
@@ -3603,21 +3664,43 @@ static bool gkdi_sample_valid(const gkd_training_sample *s)
            s->pdf_guide < INFINITY && s->nearness >= 0 && s->nearness < INFINITY;
 }
 
+/* gkd_find_cell of up to GKDI_GROUP positions, level by level: how deep a leaf lies cannot be predicted. */
+static void gkdi_find_cells(const gkd_node *nodes, uint32_t count, const float *const *positions, uint32_t *cells)
+{
+    uint32_t at[GKDI_GROUP], k, more = 1;
+    memset(at, 0, sizeof at);
+    while (more) {
+        more = 0;
+        for (k = 0; k < count; ++k) {
+            uint32_t link = nodes[at[k]].link;
+            uint32_t next = (link & 0x1fffffffu) + !(positions[k][link >> 29 & 3] < nodes[at[k]].split);
+            at[k] = link & GKD_LEAF ? at[k] : next;
+            more |= ~link & GKD_LEAF;
+        }
+    }
+    for (k = 0; k < count; ++k)
+        cells[k] = nodes[at[k]].link & ~GKD_LEAF;
+}
+
 static void gkdi_locate(void *context, uint32_t begin, uint32_t end)
 {
     gkdi_update *u = (gkdi_update *)context;
-    gkd_view building;
-    uint32_t i;
-    memset(&building, 0, sizeof building);
-    building.nodes = u->field->nodes; /* all that finding a cell reads */
-    for (i = begin; i < end; ++i) {
-        const gkd_training_sample *s = &u->samples[i];
-        float p[3];
-        u->cell_of[i] = GKDI_NONE;
-        if (!gkdi_sample_valid(s))
-            continue;
-        gkdi_place(&u->field->desc, s, p);
-        u->cell_of[i] = gkd_find_cell(&building, p);
+    float place[GKDI_GROUP][3];
+    const float *places[GKDI_GROUP];
+    bool valid[GKDI_GROUP];
+    uint32_t i, k, n;
+    for (k = 0; k < GKDI_GROUP; ++k)
+        places[k] = place[k];
+    for (i = begin; i < end; i += n) {
+        n = end - i < GKDI_GROUP ? end - i : GKDI_GROUP;
+        for (k = 0; k < n; ++k) {
+            gkdi_place(&u->field->desc, &u->samples[i + k], place[k]);
+            valid[k] = gkdi_sample_valid(&u->samples[i + k]);
+        }
+        gkdi_find_cells(u->field->nodes, n, places, u->cell_of + i);
+        for (k = 0; k < n; ++k)
+            if (!valid[k])
+                u->cell_of[i + k] = GKDI_NONE;
     }
 }
 
@@ -3652,6 +3735,7 @@ static void gkdi_sort(gkdi_update *u, uint32_t *start)
         u->outcomes[u->outcome_count].first = at;
         u->outcomes[u->outcome_count++].end = at += n;
     }
+    u->kept = at;
     for (i = 0; i < u->count; ++i)
         if (u->cell_of[i] != GKDI_NONE)
             u->order[start[u->cell_of[i]]++] = i;
@@ -3766,7 +3850,7 @@ static bool gkdi_update_start(gkdi_update *u, gkd_field *field, uint32_t **start
     u->field = field;
     u->samples = field->pending;
     u->count = field->pending_count;
-    u->cell_of = (uint32_t *)gkdi_allocate(desc, 2 * (uint64_t)u->count, sizeof *u->cell_of);
+    u->cell_of = (uint32_t *)desc->allocate(desc->user, ((size_t)u->count + 1) * 2 * sizeof *u->cell_of);
     u->outcomes = (gkdi_outcome *)gkdi_allocate(desc, cells, sizeof *u->outcomes);
     *start = (uint32_t *)gkdi_allocate(desc, field->cell_count, sizeof **start);
     if (u->cell_of && u->outcomes && *start) {
@@ -3953,7 +4037,7 @@ static bool gkdi_pending_room(gkd_field *field, uint64_t count)
     while (n < need)
         n *= 2;
     n = n < field->desc.update_samples ? n : field->desc.update_samples;
-    pending = (gkd_training_sample *)gkdi_allocate(&field->desc, n, sizeof *pending);
+    pending = (gkd_training_sample *)field->desc.allocate(field->desc.user, (size_t)n * sizeof *pending);
     if (!pending)
         return false;
     if (field->pending_count)
@@ -3991,7 +4075,11 @@ GKD_API gkd_result gkd_accumulate(gkd_field *field, gkd_stream *const *streams, 
                                   gkd_parallel_fn parallel, void *user)
 {
     gkd_result result = GKD_OK;
+    uint64_t all = 0;
     uint32_t i;
+    for (i = 0; i < count; ++i)
+        all += streams[i]->size;
+    gkdi_pending_room(field, all); /* at once; where that fails, a chunk may still fit */
     for (i = 0; i < count; ++i) {
         gkdi_samples *chunk;
         field->stats.lost += streams[i]->lost - streams[i]->lost_told;
@@ -4340,8 +4428,6 @@ GKD_API const gkd_desc *gkd_get_desc(const gkd_field *field) { return &field->de
 GKD_API uint32_t gkd_cell_count(const gkd_field *field) { return field->block->cells; }
 
 /* ---- >>batches ---------------------------------------------------------------------------------------------- */
-
-#define GKDI_GROUP 16 /* handles oriented together */
 
 /* What a handle is to be made of. */
 typedef struct gkdi_view_from {
@@ -5051,9 +5137,9 @@ GKDI_WIDE static void gkdi_orient_wide(uint32_t count, const gkdi_view_from *fro
             part[n].lobes = from[i].lobes + k;
             part[n].of = i;
             part[n].left = h->count - k;
-            __builtin_prefetch(part[n].lobes);
-            __builtin_prefetch((const char *)part[n].lobes + 64);
-            __builtin_prefetch((const char *)part[n].lobes + 128);
+            GKDI_PREFETCH(part[n].lobes);
+            GKDI_PREFETCH((const char *)part[n].lobes + 64);
+            GKDI_PREFETCH((const char *)part[n].lobes + 128);
         }
     }
     for (k = 0; k < n; ++k)
@@ -5294,29 +5380,6 @@ GKD_API void gkd_sample_batch(const gkd_view *view, uint32_t count, const uint32
     }
 }
 
-/* gkd_find_cell of up to GKDI_GROUP positions, level by level: how deep a leaf lies cannot be predicted. */
-static void gkdi_find_cells(const gkd_view *view, uint32_t count, const float *const *positions, uint32_t *cells)
-{
-    const gkd_node *nodes = view->nodes;
-    uint32_t at[GKDI_GROUP], k, more = 1;
-    if (count == 1) {
-        cells[0] = gkd_find_cell(view, positions[0]);
-        return;
-    }
-    memset(at, 0, sizeof at);
-    while (more) {
-        more = 0;
-        for (k = 0; k < count; ++k) {
-            uint32_t link = nodes[at[k]].link;
-            uint32_t next = (link & 0x1fffffffu) + !(positions[k][link >> 29 & 3] < nodes[at[k]].split);
-            at[k] = link & GKD_LEAF ? at[k] : next;
-            more |= ~link & GKD_LEAF;
-        }
-    }
-    for (k = 0; k < count; ++k)
-        cells[k] = nodes[at[k]].link & ~GKD_LEAF;
-}
-
 GKD_API void gkd_find_batch(const gkd_view *view, uint32_t count, const uint32_t *index, const float *positions,
                             size_t position_stride, const float *normals, size_t normal_stride, const float *u,
                             size_t u_stride, gkd_handle *handles, float *alpha)
@@ -5335,7 +5398,10 @@ GKD_API void gkd_find_batch(const gkd_view *view, uint32_t count, const uint32_t
                 at[k] = jittered[k];
             }
         }
-        gkdi_find_cells(view, n, at, cells);
+        if (n > 1)
+            gkdi_find_cells(view->nodes, n, at, cells);
+        else
+            cells[0] = gkd_find_cell(view, at[0]); /* shorter: nothing to overlap */
         for (k = 0; k < n; ++k) {
             uint32_t i = gkdi_at(index, done + k);
             const float *position = gkdi_row(positions, position_stride, i);
