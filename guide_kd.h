@@ -1652,6 +1652,7 @@ typedef struct gkdi_model {
    2^20 samples; all are flat around the chosen value but where said. */
 typedef struct gkdi_fit_options {
     uint32_t simd;         /* GKDI_BASE ...; the same bits from all */
+    uint32_t most;         /* lobes of a mixture, 1 .. GKD_MAX_LOBES */
     uint32_t lobes;        /* first lobes at most; 8 .. 16 differ by 4 % */
     uint32_t seed_seen;    /* while a model has seen fewer samples, a batch may bring more first lobes */
     uint32_t first_passes; /* over a subset, for a new model; 10 is worse by 2 % where samples are few */
@@ -1679,6 +1680,7 @@ static inline gkdi_fit_options gkdi_fit_defaults(void)
 {
     gkdi_fit_options o;
     memset(&o, 0, sizeof o);
+    o.most = GKD_MAX_LOBES;
     o.lobes = 12;
     o.seed_seen = 64;
     o.first_passes = 3;
@@ -2292,7 +2294,7 @@ static inline uint32_t gkdi_split_all(const gkdi_mixture *q, const gkdi_batch *b
         if (!k && o->broad_kappa > 0 && !(q->kappa[k] > 0.9f * o->broad_kappa))
             harm[k] = 0;
     }
-    while (count < GKD_MAX_LOBES) {
+    while (count < o->most) {
         uint32_t worst = 0;
         for (uint32_t k = 1; k < q->count; ++k)
             if (harm[k] > harm[worst])
@@ -2522,7 +2524,7 @@ static inline void gkdi_seed(const gkdi_item *items, uint32_t n, const gkdi_view
                              gkdi_mixture *q)
 {
     gkdi_candidates c;
-    uint32_t first = o->broad_kappa > 0, most = o->lobes < GKD_MAX_LOBES ? o->lobes : GKD_MAX_LOBES - 1, old;
+    uint32_t first = o->broad_kappa > 0, most = o->lobes + first < o->most ? o->lobes : o->most - first, old;
     float mean[3] = {0, 0, 0};
     gkdi_draw(items, n, view, GKDI_SEEDS, &c);
     if (!q->count && first) {
@@ -2551,7 +2553,8 @@ static inline void gkdi_seed(const gkdi_item *items, uint32_t n, const gkdi_view
 /* Lobes for light that is new: where many more candidates lie together than the mixture expects there. [Ruppert 2020]
    has splits alone, but those need what is new to stand out of what a lobe holds, and expectation maximisation takes
    many passes to move a lobe (own). */
-static inline void gkdi_seed_new(const gkdi_item *items, uint32_t n, const gkdi_view *view, gkdi_mixture *q)
+static inline void gkdi_seed_new(const gkdi_item *items, uint32_t n, const gkdi_view *view, const gkdi_fit_options *o,
+                                 gkdi_mixture *q)
 {
     gkdi_candidates c;
     gkdi_plain_chunk at;
@@ -2575,7 +2578,7 @@ static inline void gkdi_seed_new(const gkdi_item *items, uint32_t n, const gkdi_
             expected[i] += (double)gkdi_plain_density(&blurred, k, &at, i);
         expected[i] *= 3.14159265358979 * GKDI_PAIR * c.count;
     }
-    for (uint32_t i = 0; i < c.count && q->count < GKD_MAX_LOBES; ++i) {
+    for (uint32_t i = 0; i < c.count && q->count < o->most; ++i) {
         uint32_t close = 0;
         double spread = 0, d2;
         for (uint32_t j = 0; j < c.count && 10 * expected[i] < c.count; ++j)
@@ -2728,7 +2731,7 @@ static inline void gkdi_model_fit(gkdi_model *m, const gkdi_item *items, uint32_
         if (m->seen < o->seed_seen)
             gkdi_seed(items, n, &view, o, &q);
         else
-            gkdi_seed_new(items, n, &view, &q);
+            gkdi_seed_new(items, n, &view, o, &q);
     } else
         gkdi_fit_first(m, items, n, &view, o, &q);
     gkdi_iterate(m, &q, &history, items, n, &view, o->passes, o, o->likelihood);
@@ -4267,6 +4270,7 @@ static void gkdi_field_options(gkd_field *field)
     gkdi_split_tests_init(&field->tests, (double)d->radiance_step, (double)d->direction_step, (double)d->confidence,
                           (double)d->confidence, (double)d->min_samples, d->published_tests);
     field->fit = gkdi_fit_defaults();
+    field->fit.most = d->max_lobes;
     field->fit.simd = d->simd == GKD_SIMD_AVX2 || d->simd == GKD_SIMD_AVX512 ? GKDI_AVX2 : GKDI_BASE;
 }
 
