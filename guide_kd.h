@@ -1205,15 +1205,14 @@ static bool gkdi_signature_split_axis(const gkd_signature *s, uint32_t *axis, fl
 /* Can these be sums of samples? For files. */
 static bool gkdi_signature_valid(const gkd_signature *s)
 {
-    double n = s->samples, w = 0, far = 0;
+    double n = s->samples, w = 0;
     uint32_t k;
     for (k = 0; k < 3; ++k) {
         w += s->direction[k] * s->direction[k];
-        far = fmax(far, fabs(s->mean[k])) + 0 * s->mean[k]; /* NaN stays */
-        if (!(s->variance[k] >= 0 && s->variance[k] <= 3e38f))
+        if (!(s->variance[k] >= 0 && s->variance[k] <= 3e38f && fabs(s->mean[k]) < 3e38))
             return false;
     }
-    return n >= 0 && n < 1e300 && s->lit >= 0 && s->lit <= GKDI_LIT_MAX && (double)s->lit <= n * 1.001 && far < 3e38 &&
+    return n >= 0 && n < 1e300 && s->lit >= 0 && s->lit <= GKDI_LIT_MAX && (double)s->lit <= n * 1.001 &&
            fabsf(s->split) <= 3e38f && s->sum >= 0 && s->squares >= 0 && s->squares < 1e150 &&
            s->sum * s->sum <= n * s->squares * 1.00001 && w <= s->sum * s->sum * 1.00001 && s->axis < 3;
 }

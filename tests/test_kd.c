@@ -1503,3 +1503,10 @@ int main(void)
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
+    for (int k = 0; k < 3; ++k) {
+        double mean = f->cells[0].look[0].mean[k];
+        f->cells[0].look[0].mean[k] = NAN;
+        assert_int_equal(gkd_validate(f), GKD_CORRUPT);
+        f->cells[0].look[0].mean[k] = mean;
+        OK(gkd_validate(f));
+    }
