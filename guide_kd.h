@@ -5798,7 +5798,8 @@ GKD_API gkd_result gkd_load(const gkd_desc *desc, const void *data, size_t size,
     result = gkd_resolve(&d, &d);
     if (result)
         return result == GKD_BAD_ALLOCATOR ? result : GKD_BAD_FILE;
-    if (h.cells < 1 || h.cells > GKDI_MAX_CELLS || h.nodes != 2 * h.cells - 1 || h.pending > d.update_samples ||
+    if (!gkdi_within((double)h.stats.closed_share, 0, 1) || !gkdi_within((double)h.stats.mean_alpha, 0, 1) ||
+        h.cells < 1 || h.cells > GKDI_MAX_CELLS || h.nodes != 2 * h.cells - 1 || h.pending > d.update_samples ||
         !(h.all_samples >= 0 && h.all_samples < INFINITY && h.held_samples >= 0 && h.held_samples <= h.all_samples))
         return GKD_BAD_FILE;
     f = (gkd_field *)gkdi_allocate(&d, 1, sizeof *f);

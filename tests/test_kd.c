@@ -1206,6 +1206,31 @@ static void test_merge_equals_training_together(void **state)
 
 /* One scenario with every kind of call; returns how many failed for want of memory. */
 static int scenario(counter *c)
+/* Of what a save counts, shares steer callers: gkd_record_fraction. */
+static void test_saves_with_impossible_shares_are_refused(void **state)
+{
+    (void)state;
+    static const float bad[] = {NAN, INFINITY, -1, 1.5f, -INFINITY};
+    size_t size;
+    unsigned char *data = small_save(&size);
+    for (int i = 0; i < 11; ++i) {
+        gkdi_header h;
+        gkd_field *f;
+        memcpy(&h, data, sizeof h);
+        gkd_stats keep = h.stats;
+        if (i < 10)
+            *(i & 1 ? &h.stats.closed_share : &h.stats.mean_alpha) = bad[i / 2];
+        memcpy(data, &h, sizeof h);
+        h.checksum = gkdi_hash_bytes(1, data + GKDI_CHECKED_FROM, size - GKDI_CHECKED_FROM);
+        memcpy(data, &h, sizeof h);
+        assert_int_equal(gkd_load(NULL, data, size, &f), i < 10 ? GKD_BAD_FILE : GKD_OK);
+        gkd_destroy(f);
+        h.stats = keep;
+        memcpy(data, &h, sizeof h);
+    }
+    free(data);
+}
+
 {
     enum { N = 3000 };
     gkd_desc d = unit_cube();
@@ -1510,3 +1535,4 @@ int main(void)
         f->cells[0].look[0].mean[k] = mean;
         OK(gkd_validate(f));
     }
+        cmocka_unit_test(test_saves_with_impossible_shares_are_refused),
