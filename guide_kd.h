@@ -4181,6 +4181,8 @@ static gkd_simd gkdi_simd(gkd_simd wanted)
 static void gkdi_default_u32(uint32_t *x, uint32_t value) { *x = *x ? *x : value; }
 static void gkdi_default_float(float *x, float value) { *x = *x != 0 ? *x : value; }
 static bool gkdi_within(double x, double low, double high) { return x >= low && x <= high; }
+/* A float that is set to a limit is within, whichever way the limit is rounded. */
+static bool gkdi_within_float(float x, float low, float high) { return x >= low && x <= high; }
 
 static bool gkdi_bounds_ok(const gkd_desc *d)
 {
@@ -4196,13 +4198,13 @@ static bool gkdi_bounds_ok(const gkd_desc *d)
 static bool gkdi_ranges_ok(const gkd_desc *d)
 {
     return gkdi_within(d->split_samples, 64, 1e9) && gkdi_within(d->lookahead, 1, 7) &&
-           gkdi_within(d->min_samples, 16, 1e9) && gkdi_within((double)d->radiance_step, 0.001, 100) &&
-           gkdi_within((double)d->direction_step, 0.001, 3.1) && gkdi_within((double)d->confidence, 1e-12, 0.4) &&
-           gkdi_within((double)d->keep_signatures, 0, 1) && gkdi_within(d->max_levels, 1, 60) &&
+           gkdi_within(d->min_samples, 16, 1e9) && gkdi_within_float(d->radiance_step, 0.001f, 100) &&
+           gkdi_within_float(d->direction_step, 0.001f, 3.1f) && gkdi_within_float(d->confidence, 1e-12f, 0.4f) &&
+           gkdi_within_float(d->keep_signatures, 0, 1) && gkdi_within(d->max_levels, 1, 60) &&
            gkdi_within(d->max_lobes, 1, GKD_MAX_LOBES) && gkdi_within(d->update_samples, 1024, 1 << 26) &&
-           d->max_bytes >= (uint64_t)1 << 20 && gkdi_within((double)d->alpha, 0.05, 1) &&
-           gkdi_within((double)d->uniform, 1e-4, 1) && gkdi_within((double)d->gate_margin, 0.001, 10) &&
-           gkdi_within((double)d->gate_gain, 0.0001, 1000) && gkdi_within(d->gate_probe, 1, 1000);
+           d->max_bytes >= (uint64_t)1 << 20 && gkdi_within_float(d->alpha, 0.05f, 1) &&
+           gkdi_within_float(d->uniform, 1e-4f, 1) && gkdi_within_float(d->gate_margin, 0.001f, 10) &&
+           gkdi_within_float(d->gate_gain, 0.0001f, 1000) && gkdi_within(d->gate_probe, 1, 1000);
 }
 
 GKD_API gkd_result gkd_resolve(const gkd_desc *desc, gkd_desc *resolved)
@@ -5688,7 +5690,7 @@ static gkd_result gkdi_block_valid(gkdi_block *b, uint64_t size, const gkd_desc 
     if (b->cells < 1 || b->cells > GKDI_MAX_CELLS || b->nodes != 2 * b->cells - 1)
         return GKD_CORRUPT;
     gkdi_block_layout(&shape);
-    if (shape.size != size || memcmp(&shape, b, sizeof shape) != 0 || !gkdi_within((double)b->uniform, 1e-4, 1))
+    if (shape.size != size || memcmp(&shape, b, sizeof shape) != 0 || !gkdi_within_float(b->uniform, 1e-4f, 1))
         return GKD_CORRUPT;
     seen = (unsigned char *)gkdi_allocate(desc, b->cells, 1);
     if (!seen)
