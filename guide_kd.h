@@ -3670,10 +3670,8 @@ static void gkdi_commit(gkd_field *field, gkdi_outcome *o, uint32_t leaf)
     uint32_t base = field->node_count, first = field->cell_count, i;
     gkdi_cell_free(&field->desc, &field->cells[o->cell]);
     field->cells[o->cell] = o->cells[0];
-    for (i = 1; i < o->count; ++i) {
+    for (i = 1; i < o->count; ++i)
         field->cells[field->cell_count++] = o->cells[i];
-        field->stats.levels = o->cells[i].level > field->stats.levels ? o->cells[i].level : field->stats.levels;
-    }
     for (i = 0; i < o->node_count; ++i) {
         gkd_node n = o->nodes[i];
         if (n.link & GKD_LEAF) {
@@ -4072,6 +4070,7 @@ static void gkdi_count_cells(gkd_field *field)
     uint32_t i;
     s->open_cells = s->closed_cells = s->unjudged_cells = 0;
     s->lookahead = 0;
+    s->levels = 0;
     field->guiding = 0;
     s->cells = field->block->cells;
     s->lobes = field->block->lobes;
@@ -4081,6 +4080,7 @@ static void gkdi_count_cells(gkd_field *field)
         s->closed_cells += c->gate.verdict == GKD_GATE_CLOSED;
         s->unjudged_cells += c->gate.verdict == GKD_GATE_UNJUDGED;
         s->lookahead += c->look_count - 1;
+        s->levels = c->level > s->levels ? c->level : s->levels;
     }
     for (i = 0; i < field->block->cells; ++i)
         field->guiding += gkdi_block_cells(field->block)[i].alpha < 1;

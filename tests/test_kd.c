@@ -1225,6 +1225,14 @@ static void test_saves_with_impossible_shares_are_refused(void **state)
         memcpy(data, &h, sizeof h);
         assert_int_equal(gkd_load(NULL, data, size, &f), i < 10 ? GKD_BAD_FILE : GKD_OK);
         gkd_destroy(f);
+        h.stats.levels = 77; /* counted anew */
+        h.stats.closed_share = h.stats.mean_alpha = 0;
+        memcpy(data, &h, sizeof h);
+        h.checksum = gkdi_hash_bytes(1, data + GKDI_CHECKED_FROM, size - GKDI_CHECKED_FROM);
+        memcpy(data, &h, sizeof h);
+        OK(gkd_load(NULL, data, size, &f));
+        assert_int_equal(f->stats.levels, keep.levels);
+        gkd_destroy(f);
         h.stats = keep;
         memcpy(data, &h, sizeof h);
     }
