@@ -5305,7 +5305,9 @@ GKD_API void gkd_pdf_batch(const gkd_view *view, uint32_t count, const uint32_t 
     (void)view;
     for (i = 0; i < count; ++i) {
         uint32_t at = gkdi_at(index, i);
-        pdf[at] = gkd_pdf(&handles[at], gkdi_row(directions, stride, at));
+        const float *w = gkdi_row(directions, stride, at);
+        const float direction[3] = {w[0], w[1], w[2]}; /* w may be seen to point to the first member of a struct */
+        pdf[at] = gkd_pdf(&handles[at], direction);
     }
 }
 
