@@ -1304,15 +1304,14 @@ static bool gkdi_signature_split_axis(const gkd_signature *s, uint32_t *axis, fl
 /* Can these be sums of samples? For files. */
 static bool gkdi_signature_valid(const gkd_signature *s)
 {
-    double n = s->samples, w = 0, far = 0;
+    double n = s->samples, w = 0;
     uint32_t k;
     for (k = 0; k < 3; ++k) {
         w += s->direction[k] * s->direction[k];
-        far = fmax(far, fabs(s->mean[k])) + 0 * s->mean[k]; /* NaN stays */
-        if (!(s->variance[k] >= 0 && s->variance[k] <= 3e38f))
+        if (!(s->variance[k] >= 0 && s->variance[k] <= 3e38f && fabs(s->mean[k]) < 3e38))
             return false;
     }
-    return n >= 0 && n < 1e300 && s->lit >= 0 && s->lit <= GKDI_LIT_MAX && (double)s->lit <= n * 1.001 && far < 3e38 &&
+    return n >= 0 && n < 1e300 && s->lit >= 0 && s->lit <= GKDI_LIT_MAX && (double)s->lit <= n * 1.001 &&
            fabsf(s->split) <= 3e38f && s->sum >= 0 && s->squares >= 0 && s->squares < 1e150 &&
            s->sum * s->sum <= n * s->squares * 1.00001 && w <= s->sum * s->sum * 1.00001 && s->axis < 3;
 }
@@ -1751,6 +1750,7 @@ typedef struct gkdi_model {
    2^20 samples; all are flat around the chosen value but where said. */
 typedef struct gkdi_fit_options {
     uint32_t simd;         /* GKDI_BASE ...; the same bits from all */
+    uint32_t most;         /* lobes of a mixture, 1 .. GKD_MAX_LOBES */
     uint32_t lobes;        /* first lobes at most; 8 .. 16 differ by 4 % */
     uint32_t seed_seen;    /* while a model has seen fewer samples, a batch may bring more first lobes */
     uint32_t first_passes; /* over a subset, for a new model; 10 is worse by 2 % where samples are few */
@@ -1778,6 +1778,7 @@ static inline gkdi_fit_options gkdi_fit_defaults(void)
 {
     gkdi_fit_options o;
     memset(&o, 0, sizeof o);
+    o.most = GKD_MAX_LOBES;
     o.lobes = 12;
     o.seed_seen = 64;
     o.first_passes = 3;
@@ -2391,7 +2392,7 @@ static inline uint32_t gkdi_split_all(const gkdi_mixture *q, const gkdi_batch *b
         if (!k && o->broad_kappa > 0 && !(q->kappa[k] > 0.9f * o->broad_kappa))
             harm[k] = 0;
     }
-    while (count < GKD_MAX_LOBES) {
+    while (count < o->most) {
         uint32_t worst = 0;
         for (uint32_t k = 1; k < q->count; ++k)
             if (harm[k] > harm[worst])
@@ -2621,7 +2622,7 @@ static inline void gkdi_seed(const gkdi_item *items, uint32_t n, const gkdi_view
                              gkdi_mixture *q)
 {
     gkdi_candidates c;
-    uint32_t first = o->broad_kappa > 0, most = o->lobes < GKD_MAX_LOBES ? o->lobes : GKD_MAX_LOBES - 1, old;
+    uint32_t first = o->broad_kappa > 0, most = o->lobes + first < o->most ? o->lobes : o->most - first, old;
     float mean[3] = {0, 0, 0};
     gkdi_draw(items, n, view, GKDI_SEEDS, &c);
     if (!q->count && first) {
@@ -2650,7 +2651,8 @@ static inline void gkdi_seed(const gkdi_item *items, uint32_t n, const gkdi_view
 /* Lobes for light that is new: where many more candidates lie together than the mixture expects there. [Ruppert 2020]
    has splits alone, but those need what is new to stand out of what a lobe holds, and expectation maximisation takes
    many passes to move a lobe (own). */
-static inline void gkdi_seed_new(const gkdi_item *items, uint32_t n, const gkdi_view *view, gkdi_mixture *q)
+static inline void gkdi_seed_new(const gkdi_item *items, uint32_t n, const gkdi_view *view, const gkdi_fit_options *o,
+                                 gkdi_mixture *q)
 {
     gkdi_candidates c;
     gkdi_plain_chunk at;
@@ -2674,7 +2676,7 @@ static inline void gkdi_seed_new(const gkdi_item *items, uint32_t n, const gkdi_
             expected[i] += (double)gkdi_plain_density(&blurred, k, &at, i);
         expected[i] *= 3.14159265358979 * GKDI_PAIR * c.count;
     }
-    for (uint32_t i = 0; i < c.count && q->count < GKD_MAX_LOBES; ++i) {
+    for (uint32_t i = 0; i < c.count && q->count < o->most; ++i) {
         uint32_t close = 0;
         double spread = 0, d2;
         for (uint32_t j = 0; j < c.count && 10 * expected[i] < c.count; ++j)
@@ -2827,7 +2829,7 @@ static inline void gkdi_model_fit(gkdi_model *m, const gkdi_item *items, uint32_
         if (m->seen < o->seed_seen)
             gkdi_seed(items, n, &view, o, &q);
         else
-            gkdi_seed_new(items, n, &view, &q);
+            gkdi_seed_new(items, n, &view, o, &q);
     } else
         gkdi_fit_first(m, items, n, &view, o, &q);
     gkdi_iterate(m, &q, &history, items, n, &view, o->passes, o, o->likelihood);
@@ -3800,10 +3802,8 @@ static void gkdi_commit(gkd_field *field, gkdi_outcome *o, uint32_t leaf)
     uint32_t base = field->node_count, first = field->cell_count, i;
     gkdi_cell_free(&field->desc, &field->cells[o->cell]);
     field->cells[o->cell] = o->cells[0];
-    for (i = 1; i < o->count; ++i) {
+    for (i = 1; i < o->count; ++i)
         field->cells[field->cell_count++] = o->cells[i];
-        field->stats.levels = o->cells[i].level > field->stats.levels ? o->cells[i].level : field->stats.levels;
-    }
     for (i = 0; i < o->node_count; ++i) {
         gkd_node n = o->nodes[i];
         if (n.link & GKD_LEAF) {
@@ -4206,6 +4206,7 @@ static void gkdi_count_cells(gkd_field *field)
     uint32_t i;
     s->open_cells = s->closed_cells = s->unjudged_cells = 0;
     s->lookahead = 0;
+    s->levels = 0;
     field->guiding = 0;
     s->cells = field->block->cells;
     s->lobes = field->block->lobes;
@@ -4215,6 +4216,7 @@ static void gkdi_count_cells(gkd_field *field)
         s->closed_cells += c->gate.verdict == GKD_GATE_CLOSED;
         s->unjudged_cells += c->gate.verdict == GKD_GATE_UNJUDGED;
         s->lookahead += c->look_count - 1;
+        s->levels = c->level > s->levels ? c->level : s->levels;
     }
     for (i = 0; i < field->block->cells; ++i)
         field->guiding += gkdi_block_cells(field->block)[i].alpha < 1;
@@ -4315,6 +4317,8 @@ static gkd_simd gkdi_simd(gkd_simd wanted)
 static void gkdi_default_u32(uint32_t *x, uint32_t value) { *x = *x ? *x : value; }
 static void gkdi_default_float(float *x, float value) { *x = *x != 0 ? *x : value; }
 static bool gkdi_within(double x, double low, double high) { return x >= low && x <= high; }
+/* A float that is set to a limit is within, whichever way the limit is rounded. */
+static bool gkdi_within_float(float x, float low, float high) { return x >= low && x <= high; }
 
 static bool gkdi_bounds_ok(const gkd_desc *d)
 {
@@ -4330,13 +4334,13 @@ static bool gkdi_bounds_ok(const gkd_desc *d)
 static bool gkdi_ranges_ok(const gkd_desc *d)
 {
     return gkdi_within(d->split_samples, 64, 1e9) && gkdi_within(d->lookahead, 1, 7) &&
-           gkdi_within(d->min_samples, 16, 1e9) && gkdi_within((double)d->radiance_step, 0.001, 100) &&
-           gkdi_within((double)d->direction_step, 0.001, 3.1) && gkdi_within((double)d->confidence, 1e-12, 0.4) &&
-           gkdi_within((double)d->keep_signatures, 0, 1) && gkdi_within(d->max_levels, 1, 60) &&
+           gkdi_within(d->min_samples, 16, 1e9) && gkdi_within_float(d->radiance_step, 0.001f, 100) &&
+           gkdi_within_float(d->direction_step, 0.001f, 3.1f) && gkdi_within_float(d->confidence, 1e-12f, 0.4f) &&
+           gkdi_within_float(d->keep_signatures, 0, 1) && gkdi_within(d->max_levels, 1, 60) &&
            gkdi_within(d->max_lobes, 1, GKD_MAX_LOBES) && gkdi_within(d->update_samples, 1024, 1 << 26) &&
-           d->max_bytes >= (uint64_t)1 << 20 && gkdi_within((double)d->alpha, 0.05, 1) &&
-           gkdi_within((double)d->uniform, 1e-4, 1) && gkdi_within((double)d->gate_margin, 0.001, 10) &&
-           gkdi_within((double)d->gate_gain, 0.0001, 1000) && gkdi_within(d->gate_probe, 1, 1000);
+           d->max_bytes >= (uint64_t)1 << 20 && gkdi_within_float(d->alpha, 0.05f, 1) &&
+           gkdi_within_float(d->uniform, 1e-4f, 1) && gkdi_within_float(d->gate_margin, 0.001f, 10) &&
+           gkdi_within_float(d->gate_gain, 0.0001f, 1000) && gkdi_within(d->gate_probe, 1, 1000);
 }
 
 GKD_API gkd_result gkd_resolve(const gkd_desc *desc, gkd_desc *resolved)
@@ -4403,6 +4407,7 @@ static void gkdi_field_options(gkd_field *field)
     gkdi_split_tests_init(&field->tests, (double)d->radiance_step, (double)d->direction_step, (double)d->confidence,
                           (double)d->confidence, (double)d->min_samples, d->published_tests);
     field->fit = gkdi_fit_defaults();
+    field->fit.most = d->max_lobes;
     field->fit.simd = d->simd == GKD_SIMD_AVX2 || d->simd == GKD_SIMD_AVX512 ? GKDI_AVX2 : GKDI_BASE;
 }
 
@@ -5353,7 +5358,9 @@ GKD_API void gkd_pdf_batch(const gkd_view *view, uint32_t count, const uint32_t 
     (void)view;
     for (i = 0; i < count; ++i) {
         uint32_t at = gkdi_at(index, i);
-        pdf[at] = gkd_pdf_scalar(&handles[at], gkdi_row(directions, stride, at));
+        const float *w = gkdi_row(directions, stride, at);
+        const float direction[3] = {w[0], w[1], w[2]}; /* w may be seen to point to the first member of a struct */
+        pdf[at] = gkd_pdf_scalar(&handles[at], direction);
     }
 }
 
@@ -5773,7 +5780,7 @@ static gkd_result gkdi_block_valid(gkdi_block *b, uint64_t size, const gkd_desc 
     if (b->cells < 1 || b->cells > GKDI_MAX_CELLS || b->nodes != 2 * b->cells - 1)
         return GKD_CORRUPT;
     gkdi_block_layout(&shape);
-    if (shape.size != size || memcmp(&shape, b, sizeof shape) != 0 || !gkdi_within((double)b->uniform, 1e-4, 1))
+    if (shape.size != size || memcmp(&shape, b, sizeof shape) != 0 || !gkdi_within_float(b->uniform, 1e-4f, 1))
         return GKD_CORRUPT;
     seen = (unsigned char *)gkdi_allocate(desc, b->cells, 1);
     if (!seen)
@@ -5883,7 +5890,8 @@ GKD_API gkd_result gkd_load(const gkd_desc *desc, const void *data, size_t size,
     result = gkd_resolve(&d, &d);
     if (result)
         return result == GKD_BAD_ALLOCATOR ? result : GKD_BAD_FILE;
-    if (h.cells < 1 || h.cells > GKDI_MAX_CELLS || h.nodes != 2 * h.cells - 1 || h.pending > d.update_samples ||
+    if (!gkdi_within((double)h.stats.closed_share, 0, 1) || !gkdi_within((double)h.stats.mean_alpha, 0, 1) ||
+        h.cells < 1 || h.cells > GKDI_MAX_CELLS || h.nodes != 2 * h.cells - 1 || h.pending > d.update_samples ||
         !(h.all_samples >= 0 && h.all_samples < INFINITY && h.held_samples >= 0 && h.held_samples <= h.all_samples))
         return GKD_BAD_FILE;
     f = (gkd_field *)gkdi_allocate(&d, 1, sizeof *f);

@@ -337,6 +337,46 @@ static void test_bad_descriptors_are_refused_by_name(void **state)
     assert_non_null(strstr(gkd_result_string(GKD_BAD_BOUNDS), "bounds_min"));
 }
 
+static void test_documented_limits_are_accepted(void **state)
+{
+    (void)state;
+    gkd_desc d, r;
+    gkd_field *f, *g;
+    size_t size;
+#define ACCEPTED(name, low, high)                                                                                      \
+    do {                                                                                                               \
+        for (int i = 0; i < 2; ++i) {                                                                                  \
+            d = unit_cube();                                                                                           \
+            d.name = i ? high : low;                                                                                   \
+            OK(gkd_resolve(&d, &r));                                                                                   \
+            assert_true(r.name == d.name);                                                                             \
+        }                                                                                                              \
+    } while (0)
+    ACCEPTED(split_samples, 64, 1000000000);
+    ACCEPTED(lookahead, 1, 7);
+    ACCEPTED(min_samples, 16, 1000000000);
+    ACCEPTED(radiance_step, 0.001f, 100);
+    ACCEPTED(direction_step, 0.001f, 3.1f);
+    ACCEPTED(confidence, 1e-12f, 0.4f);
+    ACCEPTED(max_levels, 1, 60);
+    ACCEPTED(max_lobes, 1, 32);
+    ACCEPTED(update_samples, 1024, 1 << 26);
+    ACCEPTED(alpha, 0.05f, 1);
+    ACCEPTED(uniform, 1e-4f, 1);
+    ACCEPTED(gate_margin, 0.001f, 10);
+    ACCEPTED(gate_gain, 0.0001f, 1000);
+    ACCEPTED(gate_probe, 1, 1000);
+#undef ACCEPTED
+    d = unit_cube();
+    d.uniform = 1e-4f; /* and in a save */
+    OK(gkd_create(&d, &f));
+    void *data = save(f, &size);
+    OK(gkd_load(NULL, data, size, &g));
+    free(data);
+    gkd_destroy(f);
+    gkd_destroy(g);
+}
+
 static void test_sizes_are_as_documented(void **state)
 {
     (void)state;
@@ -1173,6 +1213,39 @@ static void test_forged_saves_never_harm(void **state)
     free(data);
 }
 
+/* Of what a save counts, shares steer callers: gkd_record_fraction. */
+static void test_saves_with_impossible_shares_are_refused(void **state)
+{
+    (void)state;
+    static const float bad[] = {NAN, INFINITY, -1, 1.5f, -INFINITY};
+    size_t size;
+    unsigned char *data = small_save(&size);
+    for (int i = 0; i < 11; ++i) {
+        gkdi_header h;
+        gkd_field *f;
+        memcpy(&h, data, sizeof h);
+        gkd_stats keep = h.stats;
+        if (i < 10)
+            *(i & 1 ? &h.stats.closed_share : &h.stats.mean_alpha) = bad[i / 2];
+        memcpy(data, &h, sizeof h);
+        h.checksum = gkdi_hash_bytes(1, data + GKDI_CHECKED_FROM, size - GKDI_CHECKED_FROM);
+        memcpy(data, &h, sizeof h);
+        assert_int_equal(gkd_load(NULL, data, size, &f), i < 10 ? GKD_BAD_FILE : GKD_OK);
+        gkd_destroy(f);
+        h.stats.levels = 77; /* counted anew */
+        h.stats.closed_share = h.stats.mean_alpha = 0;
+        memcpy(data, &h, sizeof h);
+        h.checksum = gkdi_hash_bytes(1, data + GKDI_CHECKED_FROM, size - GKDI_CHECKED_FROM);
+        memcpy(data, &h, sizeof h);
+        OK(gkd_load(NULL, data, size, &f));
+        assert_int_equal(f->stats.levels, keep.levels);
+        gkd_destroy(f);
+        h.stats = keep;
+        memcpy(data, &h, sizeof h);
+    }
+    free(data);
+}
+
 static void test_merge_equals_training_together(void **state)
 {
     (void)state;
@@ -1472,6 +1545,13 @@ static void test_validate_notices_damage(void **state)
     f->cells[0].look[0].sum = -1;
     assert_int_equal(gkd_validate(f), GKD_CORRUPT);
     f->cells[0].look[0].sum = sum;
+    for (int k = 0; k < 3; ++k) {
+        double mean = f->cells[0].look[0].mean[k];
+        f->cells[0].look[0].mean[k] = NAN;
+        assert_int_equal(gkd_validate(f), GKD_CORRUPT);
+        f->cells[0].look[0].mean[k] = mean;
+        OK(gkd_validate(f));
+    }
     gkdi_block_nodes(f->block)[0].link = GKD_LEAF | 1000000;
     assert_int_equal(gkd_validate(f), GKD_CORRUPT);
     gkd_destroy(f);
@@ -1483,6 +1563,7 @@ int main(void)
         cmocka_unit_test(test_documented_defaults_are_the_defaults),
         cmocka_unit_test(test_the_example_in_the_comment_compiles),
         cmocka_unit_test(test_bad_descriptors_are_refused_by_name),
+        cmocka_unit_test(test_documented_limits_are_accepted),
         cmocka_unit_test(test_sizes_are_as_documented),
         cmocka_unit_test(test_an_untrained_field_is_uniform),
         cmocka_unit_test(test_density_of_a_trained_field_integrates_to_one_and_is_sampled),
@@ -1500,6 +1581,7 @@ int main(void)
         cmocka_unit_test(test_save_and_load_go_on_training_the_same),
         cmocka_unit_test(test_truncated_and_flipped_saves_are_refused),
         cmocka_unit_test(test_forged_saves_never_harm),
+        cmocka_unit_test(test_saves_with_impossible_shares_are_refused),
         cmocka_unit_test(test_merge_equals_training_together),
         cmocka_unit_test(test_every_failed_allocation_is_survived),
         cmocka_unit_test(test_lost_samples_are_counted),
