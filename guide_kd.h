@@ -4914,8 +4914,8 @@ GKDI_512_OP __m512 gkdi_rises_512(const __m512 d[3], const float *n)
     __m256 half[2][3];
     int k;
     for (k = 0; k < 3; ++k) {
-        half[0][k] = _mm512_castps512_ps256(d[k]);
-        half[1][k] = _mm512_extractf32x8_ps(d[k], 1);
+        half[0][k] = _mm512_maskz_extractf32x8_ps(0xff, d[k], 0); /* maskz: see gkdi_exp2_512 */
+        half[1][k] = _mm512_maskz_extractf32x8_ps(0xff, d[k], 1);
     }
     return _mm512_insertf32x8(_mm512_castps256_ps512(gkdi_v_rises(half[0], n)), gkdi_v_rises(half[1], n), 1);
 }
