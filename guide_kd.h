@@ -4849,8 +4849,9 @@ GKDI_WIDE static void gkdi_pdf_batch_wide(uint32_t count, const uint32_t *index,
     }
 }
 
-/* Eight directions of one handle without a surface; lanes are directions. */
-GKDI_OP gkdi_f gkdi_pdf_sphere(const gkd_handle *handle, const gkdi_f d[3])
+/* Eight directions of one handle; lanes are directions. Above a surface, c: cosines with it, least: the same with 2 for
+   those below. */
+GKDI_OP gkdi_f gkdi_pdf_sum(const gkd_handle *handle, const gkdi_f d[3], gkdi_f c, gkdi_f least, bool surface)
 {
     gkdi_f sum = gkdi_v_all(0);
     uint32_t k, l, end;
@@ -4859,28 +4860,10 @@ GKDI_OP gkdi_f gkdi_pdf_sphere(const gkd_handle *handle, const gkdi_f d[3])
         end = handle->count - k < 8 ? handle->count - k : 8;
         for (l = 0; l < end; ++l, ++b) {
             gkdi_f x = gkdi_v_sub(d[0], gkdi_v_all(b[0])), y = gkdi_v_sub(d[1], gkdi_v_all(b[8])),
-                   z = gkdi_v_sub(d[2], gkdi_v_all(b[16]));
-            x = gkdi_v_mul(gkdi_v_dot(x, y, z, x, y, z), gkdi_v_all(-b[24]));
-            sum = gkdi_v_madd(gkdi_v_exp2(x), gkdi_v_all(b[40]), sum);
-        }
-    }
-    return sum;
-}
-
-/* The same above a surface: c cosines with it, least the same with 2 for those below. */
-GKDI_OP gkdi_f gkdi_pdf_above(const gkd_handle *handle, const gkdi_f d[3], gkdi_f c, gkdi_f least)
-{
-    gkdi_f sum = gkdi_v_all(0);
-    uint32_t k, l, end;
-    for (k = 0; k < handle->count; k += 8) {
-        const float *b = (const float *)(const void *)&handle->block[k / 8];
-        end = handle->count - k < 8 ? handle->count - k : 8;
-        for (l = 0; l < end; ++l, ++b) {
-            gkdi_f x = gkdi_v_sub(d[0], gkdi_v_all(b[0])), y = gkdi_v_sub(d[1], gkdi_v_all(b[8])),
                    z = gkdi_v_sub(d[2], gkdi_v_all(b[16])), p;
             x = gkdi_v_mul(gkdi_v_dot(x, y, z, x, y, z), gkdi_v_all(-b[24]));
             p = gkdi_v_exp2(x);
-            if (gkdi_v_any(gkdi_v_less(gkdi_v_mul(least, gkdi_v_all(b[32])), gkdi_v_all(26))))
+            if (surface && gkdi_v_any(gkdi_v_less(gkdi_v_mul(least, gkdi_v_all(b[32])), gkdi_v_all(26))))
                 p = gkdi_v_add(p, gkdi_v_exp2(gkdi_v_nmadd(c, gkdi_v_all(b[32]), x)));
             sum = gkdi_v_madd(p, gkdi_v_all(b[40]), sum);
         }
@@ -4901,9 +4884,9 @@ GKDI_WIDE static void gkdi_pdf_same_wide(const gkd_handle *handle, uint32_t coun
         if (surface) {
             gkdi_f c = gkdi_v_rises(d, n);
             gkdi_mask above = gkdi_v_less(gkdi_v_all(0), c);
-            sum = gkdi_v_where(above, gkdi_pdf_above(handle, d, c, gkdi_v_pick(above, c, gkdi_v_all(2))));
+            sum = gkdi_v_where(above, gkdi_pdf_sum(handle, d, c, gkdi_v_pick(above, c, gkdi_v_all(2)), true));
         } else
-            sum = gkdi_pdf_sphere(handle, d);
+            sum = gkdi_pdf_sum(handle, d, d[0], d[0], false);
         gkdi_v_store(pdf + i, gkdi_v_madd(sum, gkdi_v_all(1 - e), gkdi_v_all(e * (1 / (4 * GKD_PI)))));
     }
 }
@@ -4953,13 +4936,13 @@ GKDI_512_OP __m512 gkdi_rises_512(const __m512 d[3], const float *n)
     __m256 half[2][3];
     int k;
     for (k = 0; k < 3; ++k) {
-        half[0][k] = _mm512_castps512_ps256(d[k]);
-        half[1][k] = _mm512_extractf32x8_ps(d[k], 1);
+        half[0][k] = _mm512_maskz_extractf32x8_ps(0xff, d[k], 0); /* maskz: see gkdi_exp2_512 */
+        half[1][k] = _mm512_maskz_extractf32x8_ps(0xff, d[k], 1);
     }
     return _mm512_insertf32x8(_mm512_castps256_ps512(gkdi_v_rises(half[0], n)), gkdi_v_rises(half[1], n), 1);
 }
 
-/* gkdi_pdf_sphere or, with a surface, gkdi_pdf_above. */
+/* gkdi_pdf_sum. */
 GKDI_512_OP __m512 gkdi_pdf_sum_512(const gkd_handle *handle, const __m512 d[3], __m512 c, __m512 least, bool surface)
 {
     __m512 sum = _mm512_setzero_ps();
