@@ -26,15 +26,6 @@ static void evidence_free(evidence *e)
     memset(e, 0, sizeof *e);
 }
 
-static void picture_path(char *path, size_t size, const char *out, const char *kind, const row *r, const char *end)
-{
-    int n = snprintf(path, size, "%s/%s/%s-%s-%s-%s-%d%s", out, kind, r->scene, r->build, r->method, r->budget, r->seed,
-                     end);
-    for (int i = (int)strlen(out) + (int)strlen(kind) + 2; i < n && i < (int)size - 1; ++i)
-        if (path[i] == ':' || path[i] == '=' || path[i] == '/')
-            path[i] = '_';
-}
-
 static void evidence_add(evidence *e, const tr_image *color, const tr_image *variance, double spp, int half)
 {
     size_t n = (size_t)color->width * (size_t)color->height;

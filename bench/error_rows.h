@@ -234,4 +234,15 @@ static inline bool row_read_json(const char *path, row *r)
     return isfinite(r->spp) && isfinite(r->cpu_seconds);
 }
 
+/* out/kind/SCENE-BUILD-METHOD-BUDGET-SEED.end */
+static inline void picture_path(char *path, size_t size, const char *out, const char *kind, const row *r,
+                                const char *end)
+{
+    int n = snprintf(path, size, "%s/%s/%s-%s-%s-%s-%d%s", out, kind, r->scene, r->build, r->method, r->budget, r->seed,
+                     end);
+    for (int i = (int)strlen(out) + (int)strlen(kind) + 2; i < n && i < (int)size - 1; ++i)
+        if (path[i] == ':' || path[i] == '=' || path[i] == '/')
+            path[i] = '_';
+}
+
 #endif
