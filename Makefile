@@ -305,7 +305,7 @@ bench-error: deps
 run-bench-error: $(B)/render $(B)/bench_error
 	@$(B)/bench_error $(PRESET_$(PRESET)) --out out/bench-error-$(PRESET) $(ARGS)
 
-# Quick: 10 minutes of one core. Full: hours.
+# Quick: about 10 minutes of one core. Full: half a day.
 study-kd: deps
 	$(SUB) run-study-kd
 
