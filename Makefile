@@ -34,7 +34,7 @@ AR ?= ar
 
 release_FLAGS := -O3 -DNDEBUG
 debug_FLAGS := -O0 -g
-scalar_FLAGS := -O2 -g -DGSD_NO_SIMD
+scalar_FLAGS := -O2 -g -DGSD_NO_SIMD -DGKD_NO_SIMD
 sanitize_FLAGS := -O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=undefined
 tsan_FLAGS := -O1 -g -fno-omit-frame-pointer -fsanitize=thread
 coverage_FLAGS := -O0 -g --coverage
@@ -92,7 +92,7 @@ STRESSES := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/stress_*.c))
 # Programs of bench/ that are not timings: `make bench` does not run them.
 BENCH_MAINS := make_reference study_kd
 BENCH_TOOLS := $(patsubst bench/%.c,$(B)/%,$(wildcard $(BENCH_MAINS:%=bench/%.c)))
-# TESTS="a b" picks test_a and test_b, and "matrix", "rig", "cli"; empty = all.
+# TESTS="a b" picks test_a and test_b, and "matrix", "uninitialised", "rig", "cli"; empty = all.
 TEST_PROGRAMS := $(if $(TESTS),$(filter $(TESTS:%=$(B)/tests/test_%),$(TESTS_ALL)),$(TESTS_ALL))
 SOURCES := $(sort $(HEADERS) $(wildcard examples/*.c examples/tracer/*.[ch] examples/tracer/*.cpp tests/*.[ch] tests/*/*.[ch] bench/*.[ch] bench/*.cpp))
 SCRIPTS := .ci/run $(wildcard tests/*.sh examples/*.sh bench/*.sh)

@@ -74,8 +74,9 @@
      g = contribution, p_a = a pdf_bsdf + (1 - a) pdf_guide, is the second moment with selection probability a; m = mean
      of g / p; W^2 = mean of (pixel_contribution / g)^2, weighted as in V(1), turns squared contributions into squared
      pixels. Guiding pays where V(1) > (1 + gate_margin) V(a) + gate_gain / W^2. Since no guide has V(a) < m^2, a cell
-     with V(1) < m^2 + gate_gain / W^2 closes without waiting for a good mixture. Verdicts need 95 % confidence; cells
-     without verdict guide. Without a pixel estimate (gkd_pass.pixel_estimate) 1 / W^2 = 16 m^2.
+     with V(1) < m^2 + gate_gain / W^2 closes whatever its mixture, though not before eight refines: light that is rare
+     must have had the time to be found. Verdicts need 95 % confidence; cells without verdict guide. Without a pixel
+     estimate (gkd_pass.pixel_estimate) 1 / W^2 = 16 m^2.
 
      Use with another directional model: desc.no_mixtures keeps the tree and its splits only. gkd_find_cell tells the
      cell; gkd_pass.on_split tells of each split in order, which the other model repeats.
@@ -135,8 +136,9 @@
 #ifndef GKD_API /* linkage of the functions; e.g. static */
 #define GKD_API extern
 #endif
-#ifndef GKD_QUERY /* qualifiers of the inline queries; e.g. __device__ static inline */
+#ifndef GKD_QUERY /* qualifiers of the inline queries; e.g. __device__ static inline: then they call nothing */
 #define GKD_QUERY static inline
+#define GKD_QUERY_SIMD 1
 #endif
 /* Other macros, read by the implementation only: GKD_ASSERT(x), GKD_MALLOC(n), GKD_FREE(p), GKD_NO_SIMD. */
 
@@ -375,15 +377,15 @@ GKD_API gkd_result gkd_merge(gkd_field *field, const gkd_field *source, gkd_para
 
 /* ---- >>query ------------------------------------------------------------------------------------------------ */
 
-/* Lobes as seen from a position, sixteen a block of 448 bytes, so that lanes are lobes. Lanes past the last lobe have
+/* Lobes as seen from a position, eight a block of 224 bytes, so that lanes are lobes. Lanes past the last lobe have
    scale 0 and upper 1. Density of a lobe at w: scale 2^(-falloff |w - mean|^2), and the same at w mirrored about the
    surface where there is one: |mirrored w - mean|^2 = |w - mean|^2 + 4 (w . normal) (mean . normal). */
 typedef struct gkd_lobe_block {
-    float x[16], y[16], z[16]; /* unit mean; on the normal's side */
-    float falloff[16];         /* kappa / 2 in powers of two: kappa / (2 ln 2) */
-    float lift[16];            /* 4 falloff (mean . normal) >= 0; 0 without a normal */
-    float scale[16];           /* weight kappa / (2 pi (1 - exp(-2 kappa))): density at the mean */
-    float upper[16];           /* sum of the weights up to this one; the last lobe's is 1 */
+    float x[8], y[8], z[8]; /* unit mean; on the normal's side */
+    float falloff[8];       /* kappa / 2 in powers of two: kappa / (2 ln 2) */
+    float lift[8];          /* 4 falloff (mean . normal) >= 0; 0 without a normal */
+    float scale[8];         /* weight kappa / (2 pi (1 - exp(-2 kappa))): density at the mean */
+    float upper[8];         /* sum of the weights up to this one; the last lobe's is 1 */
 } gkd_lobe_block;
 
 typedef struct gkd_handle {
@@ -392,9 +394,17 @@ typedef struct gkd_handle {
     float alpha, reflected;
     float normal[3];      /* 0 = full sphere. Else directions below are mirrored up: p'(w) = p(w) + p(mirrored w) */
     float uniform;        /* e: share of uniform sphere sampling */
-    uint32_t reserved[7]; /* the blocks start at byte 64 */
-    gkd_lobe_block block[GKD_MAX_LOBES / 16]; /* (count + 15) / 16 are set */
+    uint32_t simd;        /* level of the view that found it: gkd_sample and gkd_pdf use it */
+    uint32_t reserved[6]; /* the blocks start at byte 64 */
+    gkd_lobe_block block[GKD_MAX_LOBES / 8]; /* (count + 7) / 8 are set */
 } gkd_handle;
+
+/* Find, sample and pdf of one, by the SIMD level: what the inline functions call, unless GKD_QUERY is defined. About
+   twice the time of batches: one waits for its own results. [any thread] */
+GKD_API void gkd_find_one(const gkd_view *view, const float position[3], const float *normal, const float *u,
+                          gkd_handle *handle);
+GKD_API float gkd_sample_one(const gkd_handle *handle, const float u[2], float direction[3]);
+GKD_API float gkd_pdf_one(const gkd_handle *handle, const float direction[3]);
 
 #define GKD_LN2 0.69314718055994531f
 #define GKD_LOG2E 1.44269504088896341f
@@ -444,29 +454,27 @@ GKD_QUERY float gkd_minus_log1m(float y)
     e = (int32_t)(bits - 0x3f3504f3u) >> 23;
     bits -= (uint32_t)e << 23;
     memcpy(&t, &bits, sizeof t);
-    d = e == 0 ? -y : t - 1;
+    d = t - 1;
+    d += (float)(e == 0) * (-y - d); /* -y there: exact; no branch */
     z = d / (2 + d);
     q = z * z;
     q = 2 * z * (1 + q * (1.0f / 3 + q * (1.0f / 5 + q * (1.0f / 7 + q * (1.0f / 9)))));
     return -(q + (float)e * GKD_LN2);
 }
 
-/* Sine and cosine of 2 pi u. */
+/* sin(2 pi x) for |x| <= 1/4; minimax: error 2e-7, of rounding. */
+GKD_QUERY float gkd_sine(float x)
+{
+    float q = x * x;
+    return x * (6.2831852f + q * (-41.341655f + q * (81.601004f + q * (-76.549782f + q * 39.536707f))));
+}
+
+/* Sine and cosine of 2 pi u, 0 <= u < 1, without branches, which could not be predicted. */
 GKD_QUERY void gkd_circle(float u, float *sine, float *cosine)
 {
-    float f = u * 4, x, s, c, q;
-    int32_t k = (int32_t)(f + 0.5f);
-    f -= (float)k;
-    x = f * (GKD_PI / 2);
-    q = x * x;
-    s = x * (1 + q * (-1.0f / 6 + q * (1.0f / 120 + q * (-1.0f / 5040))));
-    c = 1 + q * (-1.0f / 2 + q * (1.0f / 24 + q * (-1.0f / 720 + q * (1.0f / 40320))));
-    *sine = k & 1 ? c : s;
-    *cosine = k & 1 ? s : c;
-    if (k & 2)
-        *sine = -*sine;
-    if ((k + 1) & 2)
-        *cosine = -*cosine;
+    float d = 0.5f - u;
+    *sine = gkd_sine(gkd_most(gkd_least(d, 0.5f - d), -0.5f - d));
+    *cosine = gkd_sine(fabsf(d) - 0.25f);
 }
 
 /* a . b without cancellation. */
@@ -489,11 +497,11 @@ GKD_QUERY float gkd_dot(const float a[3], const float b[3])
  */
 GKD_QUERY void gkd_turn_lobe(gkd_handle *handle, uint32_t i, const gkd_lobe *lobe, const float offset[3])
 {
-    gkd_lobe_block *b = &handle->block[i / 16];
+    gkd_lobe_block *b = &handle->block[i / 8];
     float x = lobe->mean[0] + offset[0] * lobe->nearness, y = lobe->mean[1] + offset[1] * lobe->nearness;
     float z = lobe->mean[2] + offset[2] * lobe->nearness, l2 = x * x + y * y + z * z, r;
     bool fine = l2 > 1e-6f && l2 < 1e12f;
-    i %= 16;
+    i %= 8;
     r = fine ? 1 / sqrtf(l2) : 1;
     b->x[i] = fine ? x * r : lobe->mean[0];
     b->y[i] = fine ? y * r : lobe->mean[1];
@@ -513,10 +521,10 @@ GKD_QUERY void gkd_turn_lobe(gkd_handle *handle, uint32_t i, const gkd_lobe *lob
    predicted. Own. */
 GKD_QUERY void gkd_weigh_lobe(gkd_handle *handle, uint32_t i, bool product)
 {
-    gkd_lobe_block *b = &handle->block[i / 16];
+    gkd_lobe_block *b = &handle->block[i / 8];
     const float *n = handle->normal;
     float c, c2, k, j, d, m, s, x, a, phi, q, tail, above, e;
-    i %= 16;
+    i %= 8;
     c = b->x[i] * n[0] + b->y[i] * n[1] + b->z[i] * n[2];
     c2 = gkd_least(c * c, 1);
     k = b->falloff[i];
@@ -539,10 +547,10 @@ GKD_QUERY void gkd_weigh_lobe(gkd_handle *handle, uint32_t i, bool product)
    is to be. */
 GKD_QUERY void gkd_tilt_lobe(gkd_handle *handle, uint32_t i)
 {
-    gkd_lobe_block *b = &handle->block[i / 16];
+    gkd_lobe_block *b = &handle->block[i / 8];
     const float *n = handle->normal;
     float k, l2, r, m[3];
-    i %= 16;
+    i %= 8;
     k = b->falloff[i];
     r = b->lift[i];
     m[0] = b->x[i] * k + n[0] * r;
@@ -590,17 +598,17 @@ GKD_QUERY void gkd_finish_lobes(gkd_handle *handle, float sum)
     float l = 1 / sum, upper = 0;
     uint32_t i;
     for (i = 0; i < handle->count; ++i) {
-        gkd_lobe_block *b = &handle->block[i / 16];
-        float k = b->falloff[i % 16], w = b->upper[i % 16] * l;
-        b->scale[i % 16] = w * k / (2 * GKD_PI * gkd_one_minus_exp(2 * k));
-        b->falloff[i % 16] = k * (0.5f * GKD_LOG2E);
-        b->upper[i % 16] = upper += w;
+        gkd_lobe_block *b = &handle->block[i / 8];
+        float k = b->falloff[i % 8], w = b->upper[i % 8] * l;
+        b->scale[i % 8] = w * k / (2 * GKD_PI * gkd_one_minus_exp(2 * k));
+        b->falloff[i % 8] = k * (0.5f * GKD_LOG2E);
+        b->upper[i % 8] = upper += w;
     }
-    handle->block[(i - 1) / 16].upper[(i - 1) % 16] = 1;
-    for (; i % 16; ++i) {
-        gkd_lobe_block *b = &handle->block[i / 16];
-        b->x[i % 16] = b->y[i % 16] = b->falloff[i % 16] = b->lift[i % 16] = b->scale[i % 16] = 0;
-        b->z[i % 16] = b->upper[i % 16] = 1;
+    handle->block[(i - 1) / 8].upper[(i - 1) % 8] = 1;
+    for (; i % 8; ++i) {
+        gkd_lobe_block *b = &handle->block[i / 8];
+        b->x[i % 8] = b->y[i % 8] = b->falloff[i % 8] = b->lift[i % 8] = b->scale[i % 8] = 0;
+        b->z[i % 8] = b->upper[i % 8] = 1;
     }
 }
 
@@ -612,6 +620,7 @@ GKD_QUERY bool gkd_place_handle(gkd_handle *handle, const float pivot[3], const 
     bool surface = l > 0.5f && l < 2;
     uint32_t i;
     handle->surface = surface;
+    handle->simd = GKD_SIMD_SCALAR; /* find knows better */
     for (i = 0; i < 3; ++i) {
         offset[i] = pivot[i] - position[i];
         handle->normal[i] = surface ? normal[i] : 0;
@@ -638,7 +647,7 @@ GKD_QUERY void gkd_orient_lobes_as(gkd_handle *handle, const gkd_lobe *lobes, ui
     for (i = 0; surface && i < count; ++i)
         gkd_tilt_lobe(handle, i);
     for (i = 0; i < count; ++i)
-        sum += handle->block[i / 16].upper[i % 16];
+        sum += handle->block[i / 8].upper[i % 8];
     if (!(sum > GKD_DIM)) {
         gkd_set_plain(handle, product);
         sum = 1;
@@ -655,29 +664,36 @@ GKD_QUERY void gkd_orient_lobes(gkd_handle *handle, const gkd_lobe *lobes, uint3
 /* Pdf, sample */
 
 /* Density (1/sr) of a unit direction: (1 - e) p' + e / (4 pi), and e / (4 pi) below the surface. By differences, since
-   kappa (mean . w - 1) cancels. Relative error 1e-5. [any thread] */
-GKD_QUERY float gkd_pdf(const gkd_handle *handle, const float direction[3])
+   kappa (mean . w - 1) cancels. Relative error 1e-5. */
+GKD_QUERY float gkd_pdf_scalar(const gkd_handle *handle, const float direction[3])
 {
     const float e = handle->uniform, x = direction[0], y = direction[1], z = direction[2];
     float sum[8] = {0, 0, 0, 0, 0, 0, 0, 0}, c;
     uint32_t i, k;
-    bool surface = handle->surface != 0;
+    float mirrored = handle->surface ? 1.0f : 0.0f; /* no branch in the loop: then it is vectors */
     c = gkd_dot(direction, handle->normal);
-    if (surface && !(c > 0))
+    if (handle->surface && !(c > 0))
         return e * (1 / (4 * GKD_PI));
     for (i = 0; i < handle->count; i += 8) {
-        const gkd_lobe_block *b = &handle->block[i / 16];
-        const uint32_t o = i % 16;
+        const gkd_lobe_block *b = &handle->block[i / 8];
         for (k = 0; k < 8; ++k) {
-            float dx = x - b->x[o + k], dy = y - b->y[o + k], dz = z - b->z[o + k];
-            float t = -b->falloff[o + k] * (dx * dx + dy * dy + dz * dz), p = gkd_exp2(t);
-            if (surface)
-                p += gkd_exp2(t - b->lift[o + k] * c);
-            sum[k] += b->scale[o + k] * p;
+            float dx = x - b->x[k], dy = y - b->y[k], dz = z - b->z[k];
+            float t = -b->falloff[k] * (dx * dx + dy * dy + dz * dz);
+            sum[k] += b->scale[k] * (gkd_exp2(t) + mirrored * gkd_exp2(t - b->lift[k] * c));
         }
     }
     return (1 - e) * (((sum[0] + sum[4]) + (sum[2] + sum[6])) + ((sum[1] + sum[5]) + (sum[3] + sum[7]))) +
            e * (1 / (4 * GKD_PI));
+}
+
+/* Density (1/sr) of a unit direction, as above, by the SIMD level of the handle. [any thread] */
+GKD_QUERY float gkd_pdf(const gkd_handle *handle, const float direction[3])
+{
+#ifdef GKD_QUERY_SIMD
+    if (handle->simd > GKD_SIMD_SCALAR)
+        return gkd_pdf_one(handle, direction);
+#endif
+    return gkd_pdf_scalar(handle, direction);
 }
 
 /* A draw: what to draw from, and with which numbers. */
@@ -705,11 +721,11 @@ GKD_QUERY void gkd_draw_lobe(const gkd_handle *handle, uint32_t i, float r, floa
     float low, width;
     uint32_t k;
     i = i < handle->count ? i : handle->count - 1;
-    low = i ? handle->block[(i - 1) / 16].upper[(i - 1) % 16] : 0;
-    b = &handle->block[i / 16];
-    k = i % 16;
+    low = i ? handle->block[(i - 1) / 8].upper[(i - 1) % 8] : 0;
+    b = &handle->block[i / 8];
+    k = i % 8;
     width = b->upper[k] - low;
-    out->r = (r - low + extra) / (width > 1e-9f ? width : 1e-9f);
+    out->r = (r - low + extra) / gkd_most(width, 1e-9f);
     out->mean[0] = b->x[k];
     out->mean[1] = b->y[k];
     out->mean[2] = b->z[k];
@@ -740,7 +756,7 @@ GKD_QUERY void gkd_choose_lobe(const gkd_handle *handle, const float u[2], gkd_d
     }
     for (i = 0; i < handle->count; i += 8)
         for (k = 0; k < 8; ++k)
-            n += handle->block[i / 16].upper[i % 16 + k] <= r;
+            n += handle->block[i / 8].upper[k] <= r;
     gkd_draw_lobe(handle, n, r, extra / (1 - e), out);
 }
 
@@ -749,7 +765,7 @@ GKD_QUERY void gkd_draw_direction(const gkd_draw *in, float direction[3])
 {
     const float *m = in->mean, *n = in->normal;
     float v = gkd_minus_log1m(gkd_clamp(in->r, 0, 0.99999994f) * gkd_one_minus_exp(2 * in->kappa)) / in->kappa;
-    float s, c, radius, sign = m[2] < 0 ? -1.0f : 1.0f, a = -1 / (sign + m[2]), b = m[0] * m[1] * a;
+    float s, c, radius, sign = copysignf(1, m[2]), a = -1 / (sign + m[2]), b = m[0] * m[1] * a;
     uint32_t k;
     v = v < 2 ? v : 2;
     radius = sqrtf(v * (2 - v));
@@ -761,7 +777,7 @@ GKD_QUERY void gkd_draw_direction(const gkd_draw *in, float direction[3])
     direction[1] = v * m[1] + c * sign * b + s * (sign + m[1] * m[1] * a);
     direction[2] = v * m[2] - c * sign * m[0] - s * m[1];
     a = direction[0] * n[0] + direction[1] * n[1] + direction[2] * n[2];
-    a = a < 0 ? 2 * a : 0;
+    a = 2 * gkd_least(a, 0);
     b = 0;
     for (k = 0; k < 3; ++k) {
         direction[k] -= a * n[k];
@@ -771,14 +787,23 @@ GKD_QUERY void gkd_draw_direction(const gkd_draw *in, float direction[3])
         direction[k] *= 1.5f - 0.5f * b;
 }
 
-/* Draw a direction; returns its density, of the rounded direction, by gkd_pdf. u in [0,1): u[0] chooses the lobe
-   (monotone) and, with what remains of it, the angle to its mean; u[1] the angle around. [any thread] */
-GKD_QUERY float gkd_sample(const gkd_handle *handle, const float u[2], float direction[3])
+GKD_QUERY float gkd_sample_scalar(const gkd_handle *handle, const float u[2], float direction[3])
 {
     gkd_draw draw;
     gkd_choose_lobe(handle, u, &draw);
     gkd_draw_direction(&draw, direction);
-    return gkd_pdf(handle, direction);
+    return gkd_pdf_scalar(handle, direction);
+}
+
+/* Draw a direction; returns its density, of the rounded direction, by gkd_pdf. u in [0,1): u[0] chooses the lobe
+   (monotone) and, with what remains of it, the angle to its mean; u[1] the angle around. [any thread] */
+GKD_QUERY float gkd_sample(const gkd_handle *handle, const float u[2], float direction[3])
+{
+#ifdef GKD_QUERY_SIMD
+    if (handle->simd > GKD_SIMD_SCALAR)
+        return gkd_sample_one(handle, u, direction);
+#endif
+    return gkd_sample_scalar(handle, u, direction);
 }
 
 /* Leaf of the tree at a position. NaN goes up. [any thread] */
@@ -817,18 +842,43 @@ GKD_QUERY uint32_t gkd_find_box(const gkd_view *view, const float position[3], f
     return link & ~GKD_LEAF;
 }
 
+GKD_QUERY void gkd_jitter(const gkd_view *view, const float position[3], const float u[3], float out[3])
+{
+    float low[3], high[3];
+    uint32_t axis;
+    gkd_find_box(view, position, low, high);
+    for (axis = 0; axis < 3; ++axis)
+        out[axis] = position[axis] + (u[axis] - 0.5f) * (high[axis] - low[axis]);
+}
+
 /* The cell of a position; with u, three random numbers in [0,1), that of the position jittered by the size of its cell,
    which blends neighbours. [any thread] */
 GKD_QUERY uint32_t gkd_find_cell_near(const gkd_view *view, const float position[3], const float *u)
 {
-    float low[3], high[3], p[3];
-    uint32_t axis;
+    float p[3];
     if (!u)
         return gkd_find_cell(view, position);
-    gkd_find_box(view, position, low, high);
-    for (axis = 0; axis < 3; ++axis)
-        p[axis] = position[axis] + (u[axis] - 0.5f) * (high[axis] - low[axis]);
+    gkd_jitter(view, position, u, p);
     return gkd_find_cell(view, p);
+}
+
+/* What a view knows of a cell, but for the lobes. */
+GKD_QUERY const gkd_cell *gkd_set_cell(const gkd_view *view, uint32_t index, gkd_handle *handle)
+{
+    const gkd_cell *cell = &view->cells[index];
+    handle->cell = index;
+    handle->alpha = cell->alpha;
+    handle->reflected = cell->reflected;
+    handle->uniform = view->uniform;
+    return cell;
+}
+
+GKD_QUERY void gkd_find_scalar(const gkd_view *view, const float position[3], const float *normal, const float *u,
+                               gkd_handle *handle)
+{
+    const gkd_cell *cell = gkd_set_cell(view, gkd_find_cell_near(view, position, u), handle);
+    gkd_orient_lobes_as(handle, view->lobes + cell->lobes, cell->count, cell->pivot, position, normal,
+                        !view->no_product);
 }
 
 /* Find the cell of a position and its lobes as seen from there. normal (unit, on the side that light comes from) makes
@@ -837,20 +887,19 @@ GKD_QUERY uint32_t gkd_find_cell_near(const gkd_view *view, const float position
 GKD_QUERY void gkd_find(const gkd_view *view, const float position[3], const float *normal, const float *u,
                         gkd_handle *handle)
 {
-    uint32_t index = gkd_find_cell_near(view, position, u);
-    const gkd_cell *cell = &view->cells[index];
-    handle->cell = index;
-    handle->alpha = cell->alpha;
-    handle->reflected = cell->reflected;
-    handle->uniform = view->uniform;
-    gkd_orient_lobes_as(handle, view->lobes + cell->lobes, cell->count, cell->pivot, position, normal,
-                        !view->no_product);
+#ifdef GKD_QUERY_SIMD
+    if (view->simd > GKD_SIMD_SCALAR) {
+        gkd_find_one(view, position, normal, u, handle);
+        return;
+    }
+#endif
+    gkd_find_scalar(view, position, normal, u, handle);
 }
 
 /* A handle is large and mostly unset: copy what is set. [any thread] */
 GKD_QUERY void gkd_copy_handle(gkd_handle *to, const gkd_handle *from)
 {
-    memcpy(to, from, offsetof(gkd_handle, block) + (from->count + 15) / 16 * sizeof from->block[0]);
+    memcpy(to, from, offsetof(gkd_handle, block) + (from->count + 7) / 8 * sizeof from->block[0]);
 }
 
 /* Octahedral coordinates of a direction or normal, both in [-1, 1]. [any thread] */
@@ -956,7 +1005,7 @@ GKD_QUERY gkd_training_sample gkd_make_sample(const float position[3], const flo
 
 /* The queries for arrays: several in flight at once, by the SIMD level of the view. index lists the entries to process
    in all arrays (NULL = 0 .. count - 1); strides are in bytes. normals, u and alpha (dense floats) of find may be NULL.
-   Handles are dense. Levels differ from the inline functions by <= 1e-5 relative. [any thread] */
+   Handles are dense. Levels differ from the scalar one by <= 1e-5 relative. [any thread] */
 GKD_API void gkd_find_batch(const gkd_view *view, uint32_t count, const uint32_t *index, const float *positions,
                             size_t position_stride, const float *normals, size_t normal_stride, const float *u,
                             size_t u_stride, gkd_handle *handles, float *alpha);
@@ -1013,6 +1062,12 @@ GKD_API void gkd_pdf_directions(const gkd_view *view, const gkd_handle *handle, 
 #pragma GCC optimize("fp-contract=off")
 #endif
 
+#if defined(__GNUC__) || defined(__clang__)
+#define GKDI_PREFETCH(p) __builtin_prefetch(p)
+#else
+#define GKDI_PREFETCH(p) ((void)(p))
+#endif
+
 #define GKDI_GATE_LOW 4        /* values of a below 1 at which V(a) is estimated */
 #define GKDI_MAX_VALUE 9.9e29f /* radiance or weight from here on is a bad sample */
 #define GKDI_MAX_ROOT 1e15     /* contributions are clamped to this before squaring */
@@ -1031,6 +1086,8 @@ GKD_API void gkd_pdf_directions(const gkd_view *view, const gkd_handle *handle, 
 #define GKDI_MAX_LOOK 255         /* nodes of a cell's lookahead tree: 2^(7 + 1) - 1 */
 #define GKDI_MAX_CELLS (1u << 26)
 #define GKDI_NONE 0xffffffffu
+#define GKDI_AHEAD 16       /* samples in the order of cells lie anywhere: so many are on their way */
+#define GKDI_GROUP 16       /* positions looked up, handles oriented together */
 #define GKDI_PACKED_COUNT 3 /* word of a packed mixture that holds the number of lobes */
 
 /* ---- >>memory ----------------------------------------------------------------------------------------------- */
@@ -1115,16 +1172,28 @@ typedef struct gkdi_shape {
 /* x >= 0 as f32, at most 3e38. */
 static float gkdi_float_of(double x) { return x < 3e38 ? (float)x : 3e38f; }
 
-/* One sample. value = L >= 0, finite; of zeros, neither position nor direction is read. */
-static void gkdi_signature_add(gkd_signature *s, const float position[3], const float *direction, float value)
+/* Light of one sample: all but its position. value = L >= 0, finite; of zeros, direction is not read. */
+static void gkdi_signature_light(gkd_signature *s, const float *direction, float value)
 {
-    double v = (double)value, n, gain, window;
+    double v = (double)value;
     uint32_t k;
     s->samples += 1;
     if (!(value > 0))
         return;
     s->sum += v;
     s->squares += v * v;
+    for (k = 0; k < 3; ++k)
+        s->direction[k] += v * (double)direction[k];
+}
+
+/* One sample; of zeros, the position is not read. */
+static void gkdi_signature_add(gkd_signature *s, const float position[3], const float *direction, float value)
+{
+    double n, gain, window;
+    uint32_t k;
+    gkdi_signature_light(s, direction, value);
+    if (!(value > 0))
+        return;
     if (s->lit < GKDI_LIT_MAX)
         s->lit += 1;
     n = (double)s->lit;
@@ -1132,7 +1201,6 @@ static void gkdi_signature_add(gkd_signature *s, const float position[3], const 
     window = n < GKDI_VARIANCE_WINDOW ? gain : 1.0 / GKDI_VARIANCE_WINDOW;
     for (k = 0; k < 3; ++k) {
         double away = (double)position[k] - s->mean[k], spread = (double)s->variance[k];
-        s->direction[k] += v * (double)direction[k];
         s->mean[k] += away * gain;
         spread += (away * ((double)position[k] - s->mean[k]) - spread) * window;
         s->variance[k] = gkdi_float_of(spread);
@@ -1149,6 +1217,38 @@ static void gkdi_shape_add(gkdi_shape *s, const float direction[3], float value)
     s->s[3] += x * y;
     s->s[4] += x * z;
     s->s[5] += y * z;
+}
+
+/* Many non-zero samples, in registers; positions count as if they had come one by one. */
+static void gkdi_signature_add_all(gkd_signature *s, gkdi_shape *shape, const gkdi_item *items, uint32_t count)
+{
+    gkd_signature t = *s;
+    gkdi_shape h = *shape;
+    double far[3] = {0, 0, 0}, square[3] = {0, 0, 0}, from[3], m = (double)count, old = (double)t.lit, n;
+    uint32_t i, k;
+    if (!count)
+        return;
+    for (k = 0; k < 3; ++k)
+        from[k] = t.lit > 0 ? t.mean[k] : (double)items[0].position[k];
+    for (i = 0; i < count; ++i) {
+        gkdi_signature_light(&t, items[i].direction, items[i].weight);
+        gkdi_shape_add(&h, items[i].direction, items[i].weight);
+        for (k = 0; k < 3; ++k) {
+            double away = (double)items[i].position[k] - from[k];
+            far[k] += away;
+            square[k] += away * away;
+        }
+    }
+    t.lit = gkd_least(t.lit + (float)count, GKDI_LIT_MAX);
+    n = fmin(old, GKDI_VARIANCE_WINDOW) + m;
+    for (k = 0; k < 3; ++k) {
+        double mean = far[k] / m, spread = square[k] - far[k] * mean;
+        t.mean[k] = from[k] + far[k] / fmax((double)t.lit, m);
+        spread = (spread > 0 ? spread : 0) + (n - m) * ((double)t.variance[k] + mean * mean * m / n);
+        t.variance[k] = gkdi_float_of(spread / n);
+    }
+    *s = t;
+    *shape = h;
 }
 
 /* Let what was seen so far count for `factor` of its samples [Zheng 2025, section 7.2]. All signatures that are
@@ -1204,15 +1304,14 @@ static bool gkdi_signature_split_axis(const gkd_signature *s, uint32_t *axis, fl
 /* Can these be sums of samples? For files. */
 static bool gkdi_signature_valid(const gkd_signature *s)
 {
-    double n = s->samples, w = 0, far = 0;
+    double n = s->samples, w = 0;
     uint32_t k;
     for (k = 0; k < 3; ++k) {
         w += s->direction[k] * s->direction[k];
-        far = fmax(far, fabs(s->mean[k])) + 0 * s->mean[k]; /* NaN stays */
-        if (!(s->variance[k] >= 0 && s->variance[k] <= 3e38f))
+        if (!(s->variance[k] >= 0 && s->variance[k] <= 3e38f && fabs(s->mean[k]) < 3e38))
             return false;
     }
-    return n >= 0 && n < 1e300 && s->lit >= 0 && s->lit <= GKDI_LIT_MAX && (double)s->lit <= n * 1.001 && far < 3e38 &&
+    return n >= 0 && n < 1e300 && s->lit >= 0 && s->lit <= GKDI_LIT_MAX && (double)s->lit <= n * 1.001 &&
            fabsf(s->split) <= 3e38f && s->sum >= 0 && s->squares >= 0 && s->squares < 1e150 &&
            s->sum * s->sum <= n * s->squares * 1.00001 && w <= s->sum * s->sum * 1.00001 && s->axis < 3;
 }
@@ -1625,13 +1724,14 @@ static int gkdi_compare(const gkdi_split_tests *t, const gkd_signature *cell, co
 #define GKDI_PAIR 0.05  /* squared distance of samples that may show the same light: 13 degrees */
 #define GKDI_TOP 32     /* largest weights known singly */
 #define GKDI_MIN_TEST 8 /* effective samples that a lobe needs to be split */
-#define GKDI_TESTS 6    /* soft^2, then five moments beyond those of a lobe */
+#define GKDI_TESTS 5    /* moments beyond those of a lobe */
 
 enum { GKDI_BASE, GKDI_AVX2, GKDI_PLAIN }; /* plain: without vector types */
 
 /* Sums of a mixture, in effective samples. Lobes are columns. */
 typedef struct gkdi_sums {
     float soft[GKD_MAX_LOBES];                                  /* sum of v = weight * responsibility */
+    float squares[GKD_MAX_LOBES];                               /* sum of v^2 */
     float x[GKD_MAX_LOBES], y[GKD_MAX_LOBES], z[GKD_MAX_LOBES]; /* sum of v * direction from the pivot */
     float nearness[GKD_MAX_LOBES];                              /* sum of v * nearness from the pivot */
 } gkdi_sums;
@@ -1642,7 +1742,7 @@ typedef struct gkdi_model {
     float held;     /* effective samples in the sums; sum of soft */
     float level;    /* mean weight of the samples that they stand for */
     float samples;  /* whose number that is */
-    uint32_t seen;  /* samples in all, whatever their weight, decayed or not; saturates */
+    uint32_t seen;  /* samples in all, whatever their weight, faded or not; saturates; a split halves it */
     gkdi_sums sums;
 } gkdi_model;
 
@@ -1650,12 +1750,13 @@ typedef struct gkdi_model {
    2^20 samples; all are flat around the chosen value but where said. */
 typedef struct gkdi_fit_options {
     uint32_t simd;         /* GKDI_BASE ...; the same bits from all */
+    uint32_t most;         /* lobes of a mixture, 1 .. GKD_MAX_LOBES */
     uint32_t lobes;        /* first lobes at most; 8 .. 16 differ by 4 % */
     uint32_t seed_seen;    /* while a model has seen fewer samples, a batch may bring more first lobes */
     uint32_t first_passes; /* over a subset, for a new model; 10 is worse by 2 % where samples are few */
     uint32_t passes;       /* over all samples; 1: no splits */
     uint32_t subset;       /* samples of first passes */
-    float history;         /* factor for sums held before the batch */
+    float history;         /* of all samples seen so many count: those held before a batch fade to it */
     float weight_prior;    /* samples added to each lobe's weight */
     float kappa_prior;     /* samples added to each lobe's concentration, ... */
     float kappa_spread;    /* with that 1 - mean cosine: 0.03 for many samples, 0.1 for few */
@@ -1677,14 +1778,15 @@ static inline gkdi_fit_options gkdi_fit_defaults(void)
 {
     gkdi_fit_options o;
     memset(&o, 0, sizeof o);
+    o.most = GKD_MAX_LOBES;
     o.lobes = 12;
     o.seed_seen = 64;
     o.first_passes = 3;
     o.passes = 2;
     o.subset = 1024;
-    o.history = 1;
+    o.history = 0.25f;
     o.weight_prior = 0.05f;
-    o.kappa_prior = 0.3f;
+    o.kappa_prior = 0.1f;
     o.kappa_spread = 0.06f;
     o.broad_kappa = 1;
     o.broad_prior = 1;
@@ -1693,8 +1795,8 @@ static inline gkdi_fit_options gkdi_fit_defaults(void)
     o.split_lobe = 0.1f;
     o.split_sigma = 4;
     o.split_price = 4;
-    o.merge = 0.006f;
-    o.share = 2;
+    o.merge = 0.002f;
+    o.share = 20;
     o.parallax = 4;
     o.jacobian = true;
     return o;
@@ -1711,7 +1813,8 @@ typedef struct gkdi_mixture {
 
 /* Of one pass. */
 typedef struct gkdi_batch {
-    double soft[GKD_MAX_LOBES], x[GKD_MAX_LOBES], y[GKD_MAX_LOBES], z[GKD_MAX_LOBES], nearness[GKD_MAX_LOBES];
+    double soft[GKD_MAX_LOBES], squares[GKD_MAX_LOBES], x[GKD_MAX_LOBES], y[GKD_MAX_LOBES], z[GKD_MAX_LOBES],
+        nearness[GKD_MAX_LOBES];
     double test[GKD_MAX_LOBES][GKDI_TESTS];
     double likelihood, weight;
 } gkdi_batch;
@@ -1884,7 +1987,7 @@ GKDI_INLINE void gkdi_collect(const gkdi_mixture *q, const gkdi_chunk *c, gkdi_v
 {
     for (uint32_t k = 0; k < q->count; ++k) {
         float mx = q->x[k], my = q->y[k], mz = q->z[k];
-        gkdi_v8 a[5] = {{0}, {0}, {0}, {0}, {0}};
+        gkdi_v8 a[6] = {{0}, {0}, {0}, {0}, {0}, {0}};
         for (uint32_t g = 0; g < c->groups; ++g) {
             gkdi_v8 r = density[k][g] * share[g];
             a[0] += r;
@@ -1892,6 +1995,7 @@ GKDI_INLINE void gkdi_collect(const gkdi_mixture *q, const gkdi_chunk *c, gkdi_v
             a[2] += r * (c->y[g] - my);
             a[3] += r * (c->z[g] - mz);
             a[4] += r * c->nearness[g];
+            a[5] += r * r;
         }
         double soft = (double)gkdi_add_lanes(&a[0]);
         out->soft[k] += soft;
@@ -1899,6 +2003,7 @@ GKDI_INLINE void gkdi_collect(const gkdi_mixture *q, const gkdi_chunk *c, gkdi_v
         out->y[k] += (double)gkdi_add_lanes(&a[2]) + soft * (double)my;
         out->z[k] += (double)gkdi_add_lanes(&a[3]) + soft * (double)mz;
         out->nearness[k] += (double)gkdi_add_lanes(&a[4]);
+        out->squares[k] += (double)gkdi_add_lanes(&a[5]);
     }
 }
 
@@ -1909,17 +2014,16 @@ GKDI_INLINE void gkdi_collect_tests(const gkdi_mixture *q, const gkdi_chunk *c, 
     for (uint32_t k = 0; k < q->count; ++k) {
         float mx = q->x[k], my = q->y[k], mz = q->z[k], h = q->kappa[k] * 0.5f;
         const float *s = q->s[k], *t = q->t[k];
-        gkdi_v8 sum[GKDI_TESTS] = {{0}, {0}, {0}, {0}, {0}, {0}};
+        gkdi_v8 sum[GKDI_TESTS] = {{0}, {0}, {0}, {0}, {0}};
         for (uint32_t g = 0; g < c->groups; ++g) {
             gkdi_v8 r = density[k][g] * share[g], x = c->x[g] - mx, y = c->y[g] - my, z = c->z[g] - mz;
             gkdi_v8 a = x * s[0] + y * s[1] + z * s[2], b = x * t[0] + y * t[1] + z * t[2];
             gkdi_v8 u = h * (x * x + y * y + z * z), ru = r * u;
-            sum[0] += r * r;
-            sum[1] += r * (a * a - b * b);
-            sum[2] += r * (a * b);
-            sum[3] += ru * u;
-            sum[4] += ru * a;
-            sum[5] += ru * b;
+            sum[0] += r * (a * a - b * b);
+            sum[1] += r * (a * b);
+            sum[2] += ru * u;
+            sum[3] += ru * a;
+            sum[4] += ru * b;
         }
         for (int j = 0; j < GKDI_TESTS; ++j)
             out->test[k][j] += (double)gkdi_add_lanes(&sum[j]);
@@ -2026,9 +2130,9 @@ static inline float gkdi_plain_density(const gkdi_mixture *q, uint32_t k, const 
 static inline void gkdi_plain_collect(const gkdi_mixture *q, uint32_t k, const gkdi_plain_chunk *c, bool tests,
                                       gkdi_batch *out)
 {
-    float a[5 + GKDI_TESTS][8], mx = q->x[k], my = q->y[k], mz = q->z[k], h = q->kappa[k] * 0.5f;
+    float a[6 + GKDI_TESTS][8], mx = q->x[k], my = q->y[k], mz = q->z[k], h = q->kappa[k] * 0.5f;
     const float *s = q->s[k], *t = q->t[k];
-    double sum[5 + GKDI_TESTS];
+    double sum[6 + GKDI_TESTS];
     memset(a, 0, sizeof a);
     for (uint32_t i = 0; i < c->count; ++i) {
         uint32_t j = i & 7;
@@ -2038,26 +2142,27 @@ static inline void gkdi_plain_collect(const gkdi_mixture *q, uint32_t k, const g
         a[2][j] += r * y;
         a[3][j] += r * z;
         a[4][j] += r * c->nearness[i];
+        a[5][j] += r * r;
         if (!tests)
             continue;
         float ta = x * s[0] + y * s[1] + z * s[2], tb = x * t[0] + y * t[1] + z * t[2];
         float u = h * (x * x + y * y + z * z), ru = r * u;
-        a[5][j] += r * r;
         a[6][j] += r * (ta * ta - tb * tb);
         a[7][j] += r * (ta * tb);
         a[8][j] += ru * u;
         a[9][j] += ru * ta;
         a[10][j] += ru * tb;
     }
-    for (int i = 0; i < 5 + GKDI_TESTS; ++i)
+    for (int i = 0; i < 6 + GKDI_TESTS; ++i)
         sum[i] = (double)(((a[i][0] + a[i][4]) + (a[i][2] + a[i][6])) + ((a[i][1] + a[i][5]) + (a[i][3] + a[i][7])));
     out->soft[k] += sum[0];
     out->x[k] += sum[1] + sum[0] * (double)mx;
     out->y[k] += sum[2] + sum[0] * (double)my;
     out->z[k] += sum[3] + sum[0] * (double)mz;
     out->nearness[k] += sum[4];
+    out->squares[k] += sum[5];
     for (int i = 0; tests && i < GKDI_TESTS; ++i)
-        out->test[k][i] += sum[5 + i];
+        out->test[k][i] += sum[6 + i];
 }
 
 static inline void gkdi_pass_plain(const gkdi_mixture *q, const gkdi_item *items, uint32_t n, const gkdi_view *view,
@@ -2117,9 +2222,10 @@ static inline void gkdi_mixture_set(gkdi_mixture *q, uint32_t k, const float *me
     q->log[k] = (float)log2(gkdi_max(weight, 1e-20) * gkdi_peak(kappa));
 }
 
-/* MAP: weights (soft + a) / (sum + a count); 1 - mean cosine = (soft - |direction sum| + b spread) / (soft + b): b
-   samples with the spread of a broad lobe are added (own; [Ruppert 2020] adds a mean cosine of 0, which keeps lobes of
-   fewer than kappa samples from becoming sharp). Lobe 0 stays broad and keeps a share: it answers for what no other
+/* MAP: weights (soft + a) / (sum + a count); 1 - mean cosine = (soft - |direction sum| + own spread) / (soft + own):
+   b of the lobe's own samples, own = b squares / soft, with the spread of a broad lobe are added, so that few samples
+   that are bright do not count for many (own; [Ruppert 2020] adds a mean cosine of 0, which keeps lobes of fewer than
+   kappa samples from becoming sharp). Lobe 0 stays broad and keeps a share: it answers for what no other
    lobe explains (own). */
 static inline void gkdi_maximise(const gkdi_sums *s, uint32_t count, const gkdi_fit_options *o, gkdi_mixture *q)
 {
@@ -2143,7 +2249,8 @@ static inline void gkdi_maximise(const gkdi_sums *s, uint32_t count, const gkdi_
             mean[1] = (float)(y / r);
             mean[2] = (float)(z / r);
         }
-        spread = (gkdi_max(w - r, 0) + b * (double)o->kappa_spread) / (w + b);
+        double own = w > 0 ? b * (double)s->squares[k] / w : b;
+        spread = (gkdi_max(w - r, 0) + own * (double)o->kappa_spread) / (w + own);
         kappa = gkdi_kappa(spread);
         weight = broad ? (w + (double)o->broad_prior) / sum : (w + a) / sum * factor;
         if (broad) {
@@ -2168,9 +2275,9 @@ static inline gkdi_misfit gkdi_test(const gkdi_mixture *q, const gkdi_batch *b, 
     memset(&m, 0, sizeof m);
     double w = b->soft[k], kappa = (double)q->kappa[k], end = 2 * kappa, e = gkdi_decline(kappa), tail, p = 1;
     double u[5] = {1, 0, 0, 0, 0};
-    if (!(w > 1e-12) || !(b->test[k][0] > 0) || q->kappa[k] < 0.25f)
+    if (!(w > 1e-12) || !(b->squares[k] > 0) || q->kappa[k] < 0.25f)
         return m;
-    m.samples = w * w / b->test[k][0];
+    m.samples = w * w / b->squares[k];
     if (m.samples < GKDI_MIN_TEST)
         return m;
     tail = e / (1 - e);
@@ -2187,11 +2294,11 @@ static inline gkdi_misfit gkdi_test(const gkdi_mixture *q, const gkdi_batch *b, 
     mean_b = dx * (double)q->t[k][0] + dy * (double)q->t[k][1] + dz * (double)q->t[k][2];
     mean_u = -(double)q->kappa[k] * (dx * (double)q->x[k] + dy * (double)q->y[k] + dz * (double)q->z[k]);
     flat = u[4] - u[2] * u[2] - slope * slope * var;
-    m.c[0] = b->test[k][1] / w / sqrt(2 * v2);
-    m.c[1] = b->test[k][2] / w / sqrt(v2 / 2);
-    m.c[2] = (b->test[k][3] / w - u[2] - slope * (mean_u - u[1])) / sqrt(gkdi_max(flat, 1e-12));
-    m.c[3] = (b->test[k][4] / w - c * mean_a) / sqrt(gkdi_max(vuu - c * vu, 1e-12));
-    m.c[4] = (b->test[k][5] / w - c * mean_b) / sqrt(gkdi_max(vuu - c * vu, 1e-12));
+    m.c[0] = b->test[k][0] / w / sqrt(2 * v2);
+    m.c[1] = b->test[k][1] / w / sqrt(v2 / 2);
+    m.c[2] = (b->test[k][2] / w - u[2] - slope * (mean_u - u[1])) / sqrt(gkdi_max(flat, 1e-12));
+    m.c[3] = (b->test[k][3] / w - c * mean_a) / sqrt(gkdi_max(vuu - c * vu, 1e-12));
+    m.c[4] = (b->test[k][4] / w - c * mean_b) / sqrt(gkdi_max(vuu - c * vu, 1e-12));
     for (int j = 0; j < 5; ++j)
         m.chi2 += m.c[j] * m.c[j];
     return m;
@@ -2211,10 +2318,12 @@ static inline void gkdi_unit(float *v)
 }
 
 /* Sets lobe k's sums to what `soft` samples of such a lobe would give. */
-static inline void gkdi_sums_set(gkdi_sums *s, uint32_t k, const float *mean, double kappa, float soft, float nearness)
+static inline void gkdi_sums_set(gkdi_sums *s, uint32_t k, const float *mean, double kappa, float soft, float squares,
+                                 float nearness)
 {
     float r = (float)gkdi_mean_cosine(kappa) * soft;
     s->soft[k] = soft;
+    s->squares[k] = squares;
     s->x[k] = r * mean[0];
     s->y[k] = r * mean[1];
     s->z[k] = r * mean[2];
@@ -2256,9 +2365,10 @@ static inline void gkdi_split(const gkdi_mixture *q, const gkdi_misfit *m, uint3
     gkdi_unit(two);
     gkdi_sums *both[2] = {a, b};
     for (int i = 0; i < 2; ++i) {
-        float soft = 0.5f * both[i]->soft[k], nearness = 0.5f * both[i]->nearness[k];
-        gkdi_sums_set(both[i], k, one, first, soft, nearness);
-        gkdi_sums_set(both[i], other, two, second, soft, nearness);
+        float soft = 0.5f * both[i]->soft[k], squares = 0.5f * both[i]->squares[k],
+              nearness = 0.5f * both[i]->nearness[k];
+        gkdi_sums_set(both[i], k, one, first, soft, squares, nearness);
+        gkdi_sums_set(both[i], other, two, second, soft, squares, nearness);
     }
 }
 
@@ -2282,7 +2392,7 @@ static inline uint32_t gkdi_split_all(const gkdi_mixture *q, const gkdi_batch *b
         if (!k && o->broad_kappa > 0 && !(q->kappa[k] > 0.9f * o->broad_kappa))
             harm[k] = 0;
     }
-    while (count < GKD_MAX_LOBES) {
+    while (count < o->most) {
         uint32_t worst = 0;
         for (uint32_t k = 1; k < q->count; ++k)
             if (harm[k] > harm[worst])
@@ -2341,6 +2451,7 @@ static inline double gkdi_merge_cost(const gkdi_mixture *q, uint32_t a, uint32_t
 static inline void gkdi_sums_add(gkdi_sums *s, uint32_t to, const gkdi_sums *b, uint32_t from, bool add)
 {
     s->soft[to] = b->soft[from] + (add ? s->soft[to] : 0);
+    s->squares[to] = b->squares[from] + (add ? s->squares[to] : 0);
     s->x[to] = b->x[from] + (add ? s->x[to] : 0);
     s->y[to] = b->y[from] + (add ? s->y[to] : 0);
     s->z[to] = b->z[from] + (add ? s->z[to] : 0);
@@ -2511,7 +2622,7 @@ static inline void gkdi_seed(const gkdi_item *items, uint32_t n, const gkdi_view
                              gkdi_mixture *q)
 {
     gkdi_candidates c;
-    uint32_t first = o->broad_kappa > 0, most = o->lobes < GKD_MAX_LOBES ? o->lobes : GKD_MAX_LOBES - 1, old;
+    uint32_t first = o->broad_kappa > 0, most = o->lobes + first < o->most ? o->lobes : o->most - first, old;
     float mean[3] = {0, 0, 0};
     gkdi_draw(items, n, view, GKDI_SEEDS, &c);
     if (!q->count && first) {
@@ -2540,7 +2651,8 @@ static inline void gkdi_seed(const gkdi_item *items, uint32_t n, const gkdi_view
 /* Lobes for light that is new: where many more candidates lie together than the mixture expects there. [Ruppert 2020]
    has splits alone, but those need what is new to stand out of what a lobe holds, and expectation maximisation takes
    many passes to move a lobe (own). */
-static inline void gkdi_seed_new(const gkdi_item *items, uint32_t n, const gkdi_view *view, gkdi_mixture *q)
+static inline void gkdi_seed_new(const gkdi_item *items, uint32_t n, const gkdi_view *view, const gkdi_fit_options *o,
+                                 gkdi_mixture *q)
 {
     gkdi_candidates c;
     gkdi_plain_chunk at;
@@ -2564,7 +2676,7 @@ static inline void gkdi_seed_new(const gkdi_item *items, uint32_t n, const gkdi_
             expected[i] += (double)gkdi_plain_density(&blurred, k, &at, i);
         expected[i] *= 3.14159265358979 * GKDI_PAIR * c.count;
     }
-    for (uint32_t i = 0; i < c.count && q->count < GKD_MAX_LOBES; ++i) {
+    for (uint32_t i = 0; i < c.count && q->count < o->most; ++i) {
         uint32_t close = 0;
         double spread = 0, d2;
         for (uint32_t j = 0; j < c.count && 10 * expected[i] < c.count; ++j)
@@ -2586,6 +2698,7 @@ static inline void gkdi_add(const gkdi_sums *history, const gkdi_batch *b, uint3
 {
     for (uint32_t k = 0; k < count; ++k) {
         out->soft[k] = (float)((double)history->soft[k] + b->soft[k]);
+        out->squares[k] = (float)((double)history->squares[k] + b->squares[k]);
         out->x[k] = (float)((double)history->x[k] + b->x[k]);
         out->y[k] = (float)((double)history->y[k] + b->y[k]);
         out->z[k] = (float)((double)history->z[k] + b->z[k]);
@@ -2593,10 +2706,12 @@ static inline void gkdi_add(const gkdi_sums *history, const gkdi_batch *b, uint3
     }
 }
 
-static inline void gkdi_scale(gkdi_sums *s, uint32_t count, double f)
+/* Every sample counts f times what it did, which leaves a lobe's own number of samples; of those only `keep` count. */
+static inline void gkdi_scale(gkdi_sums *s, uint32_t count, double f, double keep)
 {
     for (uint32_t k = 0; k < count; ++k) {
         s->soft[k] = (float)((double)s->soft[k] * f);
+        s->squares[k] = (float)((double)s->squares[k] * f * f / keep);
         s->x[k] = (float)((double)s->x[k] * f);
         s->y[k] = (float)((double)s->y[k] * f);
         s->z[k] = (float)((double)s->z[k] * f);
@@ -2687,8 +2802,9 @@ static inline void gkdi_model_fit(gkdi_model *m, const gkdi_item *items, uint32_
     gkdi_weights w = gkdi_weigh(items, n, gkdi_min((double)o->share / sqrt((double)n), 1));
     if (!(w.sum > 0))
         return;
-    double held = m->count ? (double)m->held * (double)o->history : 0, old = (double)m->level, level;
-    double samples = m->count ? (double)m->samples * (double)o->history : 0, total, mass;
+    double keep = gkdi_min((double)o->history * (double)m->seen / gkdi_max((double)m->samples, 1e-30), 1);
+    double held = m->count ? (double)m->held * keep : 0, old = (double)m->level, level;
+    double samples = m->count ? (double)m->samples * keep : 0, total, mass;
     double now = gkdi_max(w.sum / n, 1e-37);
     if (held > 0)
         gkdi_level(held, &old, w.effective, &now);
@@ -2708,12 +2824,12 @@ static inline void gkdi_model_fit(gkdi_model *m, const gkdi_item *items, uint32_
     if (m->count) {
         for (uint32_t k = 0; k < m->count; ++k) /* lobes to come have none */
             gkdi_sums_add(&history, k, &m->sums, k, false);
-        gkdi_scale(&history, m->count, held > 0 ? (1 - mass) * total / (double)m->held : 0);
+        gkdi_scale(&history, m->count, held > 0 ? (1 - mass) * total / (double)m->held : 0, held > 0 ? keep : 1);
         gkdi_maximise(&history, m->count, o, &q);
         if (m->seen < o->seed_seen)
             gkdi_seed(items, n, &view, o, &q);
         else
-            gkdi_seed_new(items, n, &view, &q);
+            gkdi_seed_new(items, n, &view, o, &q);
     } else
         gkdi_fit_first(m, items, n, &view, o, &q);
     gkdi_iterate(m, &q, &history, items, n, &view, o->passes, o, o->likelihood);
@@ -2743,9 +2859,10 @@ static inline uint32_t gkdi_model_lobes(const gkdi_model *m, const gkdi_fit_opti
 /* History counts `factor` times as much from now on. */
 static inline void gkdi_model_decay(gkdi_model *m, float factor)
 {
-    gkdi_scale(&m->sums, m->count, (double)factor);
+    gkdi_scale(&m->sums, m->count, (double)factor, (double)factor);
     m->held *= factor;
     m->samples *= factor;
+    m->seen = (uint32_t)((double)m->seen * (double)factor);
 }
 
 /* The same light seen from another pivot: means turn, and a lobe at finite distance becomes sharper and weaker with
@@ -2773,11 +2890,12 @@ static inline void gkdi_model_move(gkdi_model *m, const float pivot[3], const gk
         }
         const float mean[3] = {(float)(v[0] / len), (float)(v[1] / len), (float)(v[2] / len)};
         double kappa = gkdi_min(gkdi_kappa(gkdi_max(w - r, 0) / w) * f, GKDI_MAX_KAPPA);
-        gkdi_sums_set(s, k, mean, kappa, (float)(w / f), (float)(w / f * nearness / len));
+        gkdi_sums_set(s, k, mean, kappa, (float)(w / f), (float)((double)s->squares[k] / (f * f)),
+                      (float)(w / f * nearness / len));
         sum += w / f;
     }
     if (sum > 0)
-        gkdi_scale(s, m->count, (double)m->held / sum);
+        gkdi_scale(s, m->count, (double)m->held / sum, 1);
     memcpy(m->pivot, pivot, sizeof m->pivot);
 }
 
@@ -2798,8 +2916,8 @@ static inline void gkdi_model_merge(gkdi_model *a, const gkdi_model *b, const gk
     level = (double)a->samples * la + (double)c.samples * lb;
     mass = level > 0 ? (double)c.samples * lb / level : 0.5;
     total = 1 / ((1 - mass) * (1 - mass) / gkdi_max(ha, 1e-30) + mass * mass / gkdi_max(hb, 1e-30));
-    gkdi_scale(&a->sums, a->count, (1 - mass) * total / gkdi_max(ha, 1e-30));
-    gkdi_scale(&c.sums, c.count, mass * total / gkdi_max(hb, 1e-30));
+    gkdi_scale(&a->sums, a->count, (1 - mass) * total / gkdi_max(ha, 1e-30), 1);
+    gkdi_scale(&c.sums, c.count, mass * total / gkdi_max(hb, 1e-30), 1);
     a->samples += c.samples;
     level /= gkdi_max((double)a->samples, 1e-30);
     for (uint32_t k = 0; k < c.count; ++k) {
@@ -2822,14 +2940,14 @@ static inline void gkdi_model_merge(gkdi_model *a, const gkdi_model *b, const gk
     gkdi_total(a, level);
 }
 
-/* Packed form: 8 + 5 * count words of 32 bits. Returns the words written. */
-static inline uint32_t gkdi_model_words(uint32_t count) { return 8 + 5 * count; }
+/* Packed form: 8 + 6 * count words of 32 bits. Returns the words written. */
+static inline uint32_t gkdi_model_words(uint32_t count) { return 8 + 6 * count; }
 static inline uint32_t gkdi_model_pack(const gkdi_model *m, void *out)
 {
     unsigned char *p = (unsigned char *)out;
-    const float *from[5] = {m->sums.soft, m->sums.x, m->sums.y, m->sums.z, m->sums.nearness};
+    const float *from[6] = {m->sums.soft, m->sums.squares, m->sums.x, m->sums.y, m->sums.z, m->sums.nearness};
     memcpy(p, m, 32);
-    for (int i = 0; i < 5; ++i)
+    for (int i = 0; i < 6; ++i)
         memcpy(p + 32 + 4 * (size_t)i * m->count, from[i], 4 * (size_t)m->count);
     return gkdi_model_words(m->count);
 }
@@ -2837,10 +2955,10 @@ static inline uint32_t gkdi_model_unpack(gkdi_model *m, const void *in)
 {
     const unsigned char *p = (const unsigned char *)in;
     memcpy(m, p, 32);
-    float *to[5] = {m->sums.soft, m->sums.x, m->sums.y, m->sums.z, m->sums.nearness};
+    float *to[6] = {m->sums.soft, m->sums.squares, m->sums.x, m->sums.y, m->sums.z, m->sums.nearness};
     if (m->count > GKD_MAX_LOBES) /* only from a damaged file */
         m->count = 0;
-    for (int i = 0; i < 5; ++i)
+    for (int i = 0; i < 6; ++i)
         memcpy(to[i], p + 32 + 4 * (size_t)i * m->count, 4 * (size_t)m->count);
     return gkdi_model_words(m->count);
 }
@@ -3056,6 +3174,7 @@ typedef struct gkdi_update {
     uint32_t count;
     uint32_t *cell_of; /* [count], GKDI_NONE = refused */
     uint32_t *order;   /* samples by cell, each cell's in the order they came */
+    uint32_t kept;     /* how many those are */
     gkdi_outcome *outcomes;
     uint32_t outcome_count;
 } gkdi_update;
@@ -3108,47 +3227,53 @@ static uint32_t gkdi_look_room(const gkd_desc *desc, uint32_t count)
     return n < most ? n : most;
 }
 
-/* Add one sample to the cell and the lookahead cells in which it lies. Where the last of them has enough samples and
-   levels and room are left, it is divided: later samples go on below. */
-static void gkdi_look_add(const gkd_desc *desc, gkdi_cell *c, const float position[3], const float *direction,
-                          float value)
+/* Add one sample to a lookahead cell, or the cell itself, and those below in which it lies. Where the last of them has
+   enough samples and levels and room are left, it is divided: later samples go on below, and where positions lie counts
+   there only. */
+static void gkdi_look_add(const gkd_desc *desc, gkdi_cell *c, uint32_t node, const float position[3],
+                          const float *direction, float value)
 {
-    uint32_t node = 0, level = 0, levels = gkdi_look_levels(desc);
-    for (;;) {
+    uint32_t level = node ? 1 : 0, levels = gkdi_look_levels(desc);
+    for (; c->look[node].child; ++level) {
         gkd_signature *s = &c->look[node];
-        gkdi_signature_add(s, position, direction, value);
-        if (s->child) {
-            node = (uint32_t)s->child + !(position[s->axis] < s->split);
-            ++level;
-            continue;
+        gkdi_signature_light(s, direction, value);
+        node = (uint32_t)s->child + !(position[s->axis] < s->split);
+    }
+    gkdi_signature_add(&c->look[node], position, direction, value);
+    if (level < levels && c->look_count + 2 <= c->look_capacity &&
+        gkdi_signature_count(&c->look[node]) >= (double)desc->min_samples) {
+        uint32_t axis;
+        float split;
+        if (gkdi_signature_split_axis(&c->look[node], &axis, &split)) {
+            gkd_signature *s = &c->look[node];
+            s->axis = (uint8_t)axis;
+            s->split = split;
+            s->child = (uint16_t)c->look_count;
+            memset(&c->look[c->look_count], 0, 2 * sizeof *c->look);
+            c->look_count += 2;
         }
-        if (level < levels && c->look_count + 2 <= c->look_capacity &&
-            gkdi_signature_count(s) >= (double)desc->min_samples) {
-            uint32_t axis;
-            float split;
-            if (gkdi_signature_split_axis(s, &axis, &split)) {
-                s->axis = (uint8_t)axis;
-                s->split = split;
-                s->child = (uint16_t)c->look_count;
-                memset(&c->look[c->look_count], 0, 2 * sizeof *c->look);
-                c->look_count += 2;
-            }
-        }
-        return;
     }
 }
 
-/* Add a range of a batch to a cell. */
+/* Add a range of a batch to a cell. While the cell itself may yet be divided, one by one. */
 static void gkdi_feed(const gkd_desc *desc, gkdi_cell *c, const gkdi_cell_samples *batch, const uint32_t range[4])
 {
     static const float none[3] = {0, 0, 1};
+    bool divides = gkdi_look_levels(desc) > 0;
     uint32_t i;
-    for (i = range[0]; i < range[1]; ++i) {
-        gkdi_look_add(desc, c, batch->items[i].position, batch->items[i].direction, batch->items[i].weight);
+    for (i = range[0]; i < range[1] && divides && !c->look[0].child; ++i) {
+        gkdi_look_add(desc, c, 0, batch->items[i].position, batch->items[i].direction, batch->items[i].weight);
         gkdi_shape_add(&c->shape, batch->items[i].direction, batch->items[i].weight);
     }
+    gkdi_signature_add_all(&c->look[0], &c->shape, batch->items + i, range[1] - i);
+    for (; i < range[1] && divides; ++i) {
+        const gkd_signature *s = &c->look[0];
+        const gkdi_item *p = &batch->items[i];
+        gkdi_look_add(desc, c, (uint32_t)s->child + !(p->position[s->axis] < s->split), p->position, p->direction,
+                      p->weight);
+    }
     for (i = range[2]; i < range[3]; ++i)
-        gkdi_look_add(desc, c, batch->zeros[i], none, 0);
+        gkdi_look_add(desc, c, 0, batch->zeros[i], none, 0);
     c->lit += range[1] - range[0];
 }
 
@@ -3378,8 +3503,8 @@ static float gkdi_sample_pdf(const gkd_view *view, const gkd_training_sample *s,
     gkd_handle handle;
     float normal[3];
     gkd_unpack_normal(s->direction, normal);
-    gkd_find(view, s->position, normal, NULL, &handle);
-    return gkd_pdf(&handle, direction);
+    gkd_find_scalar(view, s->position, normal, NULL, &handle); /* the same bits from all levels */
+    return gkd_pdf_scalar(&handle, direction);
 }
 
 /* A sample's position, within the bounds. */
@@ -3402,9 +3527,12 @@ static void gkdi_take_samples(const gkdi_update *u, const gkdi_outcome *o, gkdi_
     uint32_t i, items = 0, zeros = 0;
     for (i = o->first; i < o->end; ++i) {
         const gkd_training_sample *s = &u->samples[u->order[i]];
+        const gkd_training_sample *soon = &u->samples[u->order[i + GKDI_AHEAD < u->kept ? i + GKDI_AHEAD : i]];
         bool rejected = s->radiance == 0 && signbit(s->radiance);
         double p = (double)s->pdf_mix, pg = (double)s->pdf_guide, g = rejected ? 0 : (double)s->contribution;
         float direction[3], position[3];
+        GKDI_PREFETCH(soon);
+        GKDI_PREFETCH(&soon->pdf_guide); /* may be on the next cache line */
         gkdi_place(desc, s, position);
         gkd_unpack_direction(s->direction, direction);
         c->gate.fresh += 1;
@@ -3555,21 +3683,43 @@ static bool gkdi_sample_valid(const gkd_training_sample *s)
            s->pdf_guide < INFINITY && s->nearness >= 0 && s->nearness < INFINITY;
 }
 
+/* gkd_find_cell of up to GKDI_GROUP positions, level by level: how deep a leaf lies cannot be predicted. */
+static void gkdi_find_cells(const gkd_node *nodes, uint32_t count, const float *const *positions, uint32_t *cells)
+{
+    uint32_t at[GKDI_GROUP], k, more = 1;
+    memset(at, 0, sizeof at);
+    while (more) {
+        more = 0;
+        for (k = 0; k < count; ++k) {
+            uint32_t link = nodes[at[k]].link;
+            uint32_t next = (link & 0x1fffffffu) + !(positions[k][link >> 29 & 3] < nodes[at[k]].split);
+            at[k] = link & GKD_LEAF ? at[k] : next;
+            more |= ~link & GKD_LEAF;
+        }
+    }
+    for (k = 0; k < count; ++k)
+        cells[k] = nodes[at[k]].link & ~GKD_LEAF;
+}
+
 static void gkdi_locate(void *context, uint32_t begin, uint32_t end)
 {
     gkdi_update *u = (gkdi_update *)context;
-    gkd_view building;
-    uint32_t i;
-    memset(&building, 0, sizeof building);
-    building.nodes = u->field->nodes; /* all that finding a cell reads */
-    for (i = begin; i < end; ++i) {
-        const gkd_training_sample *s = &u->samples[i];
-        float p[3];
-        u->cell_of[i] = GKDI_NONE;
-        if (!gkdi_sample_valid(s))
-            continue;
-        gkdi_place(&u->field->desc, s, p);
-        u->cell_of[i] = gkd_find_cell(&building, p);
+    float place[GKDI_GROUP][3];
+    const float *places[GKDI_GROUP];
+    bool valid[GKDI_GROUP];
+    uint32_t i, k, n;
+    for (k = 0; k < GKDI_GROUP; ++k)
+        places[k] = place[k];
+    for (i = begin; i < end; i += n) {
+        n = end - i < GKDI_GROUP ? end - i : GKDI_GROUP;
+        for (k = 0; k < n; ++k) {
+            gkdi_place(&u->field->desc, &u->samples[i + k], place[k]);
+            valid[k] = gkdi_sample_valid(&u->samples[i + k]);
+        }
+        gkdi_find_cells(u->field->nodes, n, places, u->cell_of + i);
+        for (k = 0; k < n; ++k)
+            if (!valid[k])
+                u->cell_of[i + k] = GKDI_NONE;
     }
 }
 
@@ -3604,6 +3754,7 @@ static void gkdi_sort(gkdi_update *u, uint32_t *start)
         u->outcomes[u->outcome_count].first = at;
         u->outcomes[u->outcome_count++].end = at += n;
     }
+    u->kept = at;
     for (i = 0; i < u->count; ++i)
         if (u->cell_of[i] != GKDI_NONE)
             u->order[start[u->cell_of[i]]++] = i;
@@ -3651,10 +3802,8 @@ static void gkdi_commit(gkd_field *field, gkdi_outcome *o, uint32_t leaf)
     uint32_t base = field->node_count, first = field->cell_count, i;
     gkdi_cell_free(&field->desc, &field->cells[o->cell]);
     field->cells[o->cell] = o->cells[0];
-    for (i = 1; i < o->count; ++i) {
+    for (i = 1; i < o->count; ++i)
         field->cells[field->cell_count++] = o->cells[i];
-        field->stats.levels = o->cells[i].level > field->stats.levels ? o->cells[i].level : field->stats.levels;
-    }
     for (i = 0; i < o->node_count; ++i) {
         gkd_node n = o->nodes[i];
         if (n.link & GKD_LEAF) {
@@ -3718,7 +3867,7 @@ static bool gkdi_update_start(gkdi_update *u, gkd_field *field, uint32_t **start
     u->field = field;
     u->samples = field->pending;
     u->count = field->pending_count;
-    u->cell_of = (uint32_t *)gkdi_allocate(desc, 2 * (uint64_t)u->count, sizeof *u->cell_of);
+    u->cell_of = (uint32_t *)desc->allocate(desc->user, ((size_t)u->count + 1) * 2 * sizeof *u->cell_of);
     u->outcomes = (gkdi_outcome *)gkdi_allocate(desc, cells, sizeof *u->outcomes);
     *start = (uint32_t *)gkdi_allocate(desc, field->cell_count, sizeof **start);
     if (u->cell_of && u->outcomes && *start) {
@@ -3905,7 +4054,7 @@ static bool gkdi_pending_room(gkd_field *field, uint64_t count)
     while (n < need)
         n *= 2;
     n = n < field->desc.update_samples ? n : field->desc.update_samples;
-    pending = (gkd_training_sample *)gkdi_allocate(&field->desc, n, sizeof *pending);
+    pending = (gkd_training_sample *)field->desc.allocate(field->desc.user, (size_t)n * sizeof *pending);
     if (!pending)
         return false;
     if (field->pending_count)
@@ -3943,7 +4092,11 @@ GKD_API gkd_result gkd_accumulate(gkd_field *field, gkd_stream *const *streams, 
                                   gkd_parallel_fn parallel, void *user)
 {
     gkd_result result = GKD_OK;
+    uint64_t all = 0;
     uint32_t i;
+    for (i = 0; i < count; ++i)
+        all += streams[i]->size;
+    gkdi_pending_room(field, all); /* at once; where that fails, a chunk may still fit */
     for (i = 0; i < count; ++i) {
         gkdi_samples *chunk;
         field->stats.lost += streams[i]->lost - streams[i]->lost_told;
@@ -4053,6 +4206,7 @@ static void gkdi_count_cells(gkd_field *field)
     uint32_t i;
     s->open_cells = s->closed_cells = s->unjudged_cells = 0;
     s->lookahead = 0;
+    s->levels = 0;
     field->guiding = 0;
     s->cells = field->block->cells;
     s->lobes = field->block->lobes;
@@ -4062,6 +4216,7 @@ static void gkdi_count_cells(gkd_field *field)
         s->closed_cells += c->gate.verdict == GKD_GATE_CLOSED;
         s->unjudged_cells += c->gate.verdict == GKD_GATE_UNJUDGED;
         s->lookahead += c->look_count - 1;
+        s->levels = c->level > s->levels ? c->level : s->levels;
     }
     for (i = 0; i < field->block->cells; ++i)
         field->guiding += gkdi_block_cells(field->block)[i].alpha < 1;
@@ -4162,6 +4317,8 @@ static gkd_simd gkdi_simd(gkd_simd wanted)
 static void gkdi_default_u32(uint32_t *x, uint32_t value) { *x = *x ? *x : value; }
 static void gkdi_default_float(float *x, float value) { *x = *x != 0 ? *x : value; }
 static bool gkdi_within(double x, double low, double high) { return x >= low && x <= high; }
+/* A float that is set to a limit is within, whichever way the limit is rounded. */
+static bool gkdi_within_float(float x, float low, float high) { return x >= low && x <= high; }
 
 static bool gkdi_bounds_ok(const gkd_desc *d)
 {
@@ -4177,13 +4334,13 @@ static bool gkdi_bounds_ok(const gkd_desc *d)
 static bool gkdi_ranges_ok(const gkd_desc *d)
 {
     return gkdi_within(d->split_samples, 64, 1e9) && gkdi_within(d->lookahead, 1, 7) &&
-           gkdi_within(d->min_samples, 16, 1e9) && gkdi_within((double)d->radiance_step, 0.001, 100) &&
-           gkdi_within((double)d->direction_step, 0.001, 3.1) && gkdi_within((double)d->confidence, 1e-12, 0.4) &&
-           gkdi_within((double)d->keep_signatures, 0, 1) && gkdi_within(d->max_levels, 1, 60) &&
+           gkdi_within(d->min_samples, 16, 1e9) && gkdi_within_float(d->radiance_step, 0.001f, 100) &&
+           gkdi_within_float(d->direction_step, 0.001f, 3.1f) && gkdi_within_float(d->confidence, 1e-12f, 0.4f) &&
+           gkdi_within_float(d->keep_signatures, 0, 1) && gkdi_within(d->max_levels, 1, 60) &&
            gkdi_within(d->max_lobes, 1, GKD_MAX_LOBES) && gkdi_within(d->update_samples, 1024, 1 << 26) &&
-           d->max_bytes >= (uint64_t)1 << 20 && gkdi_within((double)d->alpha, 0.05, 1) &&
-           gkdi_within((double)d->uniform, 1e-4, 1) && gkdi_within((double)d->gate_margin, 0.001, 10) &&
-           gkdi_within((double)d->gate_gain, 0.0001, 1000) && gkdi_within(d->gate_probe, 1, 1000);
+           d->max_bytes >= (uint64_t)1 << 20 && gkdi_within_float(d->alpha, 0.05f, 1) &&
+           gkdi_within_float(d->uniform, 1e-4f, 1) && gkdi_within_float(d->gate_margin, 0.001f, 10) &&
+           gkdi_within_float(d->gate_gain, 0.0001f, 1000) && gkdi_within(d->gate_probe, 1, 1000);
 }
 
 GKD_API gkd_result gkd_resolve(const gkd_desc *desc, gkd_desc *resolved)
@@ -4250,6 +4407,7 @@ static void gkdi_field_options(gkd_field *field)
     gkdi_split_tests_init(&field->tests, (double)d->radiance_step, (double)d->direction_step, (double)d->confidence,
                           (double)d->confidence, (double)d->min_samples, d->published_tests);
     field->fit = gkdi_fit_defaults();
+    field->fit.most = d->max_lobes;
     field->fit.simd = d->simd == GKD_SIMD_AVX2 || d->simd == GKD_SIMD_AVX512 ? GKDI_AVX2 : GKDI_BASE;
 }
 
@@ -4293,8 +4451,6 @@ GKD_API uint32_t gkd_cell_count(const gkd_field *field) { return field->block->c
 
 /* ---- >>batches ---------------------------------------------------------------------------------------------- */
 
-#define GKDI_GROUP 16 /* handles oriented together */
-
 /* What a handle is to be made of. */
 typedef struct gkdi_view_from {
     gkd_handle *handle;
@@ -4313,141 +4469,77 @@ static float *gkdi_row_out(float *base, size_t stride, uint32_t row)
     return (float *)(void *)((char *)base + stride * row);
 }
 
-/* ---- sixteen floats: AVX2 (two halves: that hides latency, too), NEON (four quarters) */
+/* ---- eight floats: AVX2, NEON (two halves) */
 
 #if GKDI_X86
 #define GKDI_WIDE __attribute__((target("avx2,fma")))
 #define GKDI_OP __attribute__((target("avx2,fma"), always_inline)) static inline
-typedef struct gkdi_f {
-    __m256 a, b;
-} gkdi_f;
-typedef struct gkdi_n {
-    __m256i a, b;
-} gkdi_n;
-typedef gkdi_f gkdi_mask;
-GKDI_OP gkdi_f gkdi_v_pair(__m256 a, __m256 b)
-{
-    gkdi_f v;
-    v.a = a;
-    v.b = b;
-    return v;
-}
-GKDI_OP gkdi_n gkdi_v_n_pair(__m256i a, __m256i b)
-{
-    gkdi_n v;
-    v.a = a;
-    v.b = b;
-    return v;
-}
-GKDI_OP gkdi_f gkdi_v_load(const float *p) { return gkdi_v_pair(_mm256_loadu_ps(p), _mm256_loadu_ps(p + 8)); }
-GKDI_OP void gkdi_v_store(float *p, gkdi_f v)
-{
-    _mm256_storeu_ps(p, v.a);
-    _mm256_storeu_ps(p + 8, v.b);
-}
-GKDI_OP gkdi_f gkdi_v_all(float a) { return gkdi_v_pair(_mm256_set1_ps(a), _mm256_set1_ps(a)); }
-#define GKDI_2(op, x, y) gkdi_v_pair(op((x).a, (y).a), op((x).b, (y).b))
-GKDI_OP gkdi_f gkdi_v_add(gkdi_f a, gkdi_f b) { return GKDI_2(_mm256_add_ps, a, b); }
-GKDI_OP gkdi_f gkdi_v_sub(gkdi_f a, gkdi_f b) { return GKDI_2(_mm256_sub_ps, a, b); }
-GKDI_OP gkdi_f gkdi_v_mul(gkdi_f a, gkdi_f b) { return GKDI_2(_mm256_mul_ps, a, b); }
-GKDI_OP gkdi_f gkdi_v_div(gkdi_f a, gkdi_f b) { return GKDI_2(_mm256_div_ps, a, b); }
-GKDI_OP gkdi_f gkdi_v_madd(gkdi_f a, gkdi_f b, gkdi_f c)
-{
-    return gkdi_v_pair(_mm256_fmadd_ps(a.a, b.a, c.a), _mm256_fmadd_ps(a.b, b.b, c.b));
-}
-GKDI_OP gkdi_f gkdi_v_nmadd(gkdi_f a, gkdi_f b, gkdi_f c)
-{
-    return gkdi_v_pair(_mm256_fnmadd_ps(a.a, b.a, c.a), _mm256_fnmadd_ps(a.b, b.b, c.b));
-}
-GKDI_OP gkdi_f gkdi_v_min(gkdi_f a, gkdi_f b) { return GKDI_2(_mm256_min_ps, a, b); } /* b where a is NaN */
-GKDI_OP gkdi_f gkdi_v_max(gkdi_f a, gkdi_f b) { return GKDI_2(_mm256_max_ps, a, b); }
-GKDI_OP gkdi_f gkdi_v_sqrt(gkdi_f v) { return gkdi_v_pair(_mm256_sqrt_ps(v.a), _mm256_sqrt_ps(v.b)); }
-GKDI_OP gkdi_mask gkdi_v_less(gkdi_f a, gkdi_f b)
-{
-    return gkdi_v_pair(_mm256_cmp_ps(a.a, b.a, _CMP_LT_OQ), _mm256_cmp_ps(a.b, b.b, _CMP_LT_OQ));
-}
-GKDI_OP gkdi_mask gkdi_v_both(gkdi_mask a, gkdi_mask b) { return GKDI_2(_mm256_and_ps, a, b); }
-GKDI_OP gkdi_f gkdi_v_where(gkdi_mask a, gkdi_f b) { return GKDI_2(_mm256_and_ps, a, b); }
-GKDI_OP gkdi_f gkdi_v_pick(gkdi_mask m, gkdi_f a, gkdi_f b)
-{
-    return gkdi_v_pair(_mm256_blendv_ps(b.a, a.a, m.a), _mm256_blendv_ps(b.b, a.b, m.b));
-}
-GKDI_OP bool gkdi_v_any(gkdi_mask m) { return _mm256_movemask_ps(_mm256_or_ps(m.a, m.b)) != 0; }
-GKDI_OP gkdi_mask gkdi_v_odd(gkdi_n v)
-{
-    return gkdi_v_pair(_mm256_castsi256_ps(_mm256_slli_epi32(v.a, 31)),
-                       _mm256_castsi256_ps(_mm256_slli_epi32(v.b, 31)));
-}
-GKDI_OP __m256 gkdi_v_negate_two8(__m256 a, __m256i b)
-{
-    __m256i sign = _mm256_slli_epi32(_mm256_and_si256(b, _mm256_set1_epi32(2)), 30);
-    return _mm256_xor_ps(a, _mm256_castsi256_ps(sign));
-}
-GKDI_OP gkdi_f gkdi_v_negate_two(gkdi_f a, gkdi_n b) { return GKDI_2(gkdi_v_negate_two8, a, b); } /* where b & 2 */
-GKDI_OP gkdi_n gkdi_v_next(gkdi_n v)
-{
-    return gkdi_v_n_pair(_mm256_add_epi32(v.a, _mm256_set1_epi32(1)), _mm256_add_epi32(v.b, _mm256_set1_epi32(1)));
-}
-GKDI_OP gkdi_f gkdi_v_float(gkdi_n v) { return gkdi_v_pair(_mm256_cvtepi32_ps(v.a), _mm256_cvtepi32_ps(v.b)); }
-GKDI_OP gkdi_n gkdi_v_truncate(gkdi_f v) { return gkdi_v_n_pair(_mm256_cvttps_epi32(v.a), _mm256_cvttps_epi32(v.b)); }
+typedef __m256 gkdi_f;
+typedef __m256 gkdi_mask;
+GKDI_OP gkdi_f gkdi_v_load(const float *p) { return _mm256_loadu_ps(p); }
+GKDI_OP void gkdi_v_store(float *p, gkdi_f v) { _mm256_storeu_ps(p, v); }
+GKDI_OP gkdi_f gkdi_v_all(float a) { return _mm256_set1_ps(a); }
+GKDI_OP gkdi_f gkdi_v_add(gkdi_f a, gkdi_f b) { return _mm256_add_ps(a, b); }
+GKDI_OP gkdi_f gkdi_v_sub(gkdi_f a, gkdi_f b) { return _mm256_sub_ps(a, b); }
+GKDI_OP gkdi_f gkdi_v_mul(gkdi_f a, gkdi_f b) { return _mm256_mul_ps(a, b); }
+GKDI_OP gkdi_f gkdi_v_div(gkdi_f a, gkdi_f b) { return _mm256_div_ps(a, b); }
+GKDI_OP gkdi_f gkdi_v_madd(gkdi_f a, gkdi_f b, gkdi_f c) { return _mm256_fmadd_ps(a, b, c); }
+GKDI_OP gkdi_f gkdi_v_nmadd(gkdi_f a, gkdi_f b, gkdi_f c) { return _mm256_fnmadd_ps(a, b, c); }
+GKDI_OP gkdi_f gkdi_v_min(gkdi_f a, gkdi_f b) { return _mm256_min_ps(a, b); } /* b where a is NaN */
+GKDI_OP gkdi_f gkdi_v_max(gkdi_f a, gkdi_f b) { return _mm256_max_ps(a, b); }
+GKDI_OP gkdi_f gkdi_v_sqrt(gkdi_f v) { return _mm256_sqrt_ps(v); }
+GKDI_OP gkdi_mask gkdi_v_less(gkdi_f a, gkdi_f b) { return _mm256_cmp_ps(a, b, _CMP_LT_OQ); }
+GKDI_OP gkdi_mask gkdi_v_both(gkdi_mask a, gkdi_mask b) { return _mm256_and_ps(a, b); }
+GKDI_OP gkdi_f gkdi_v_where(gkdi_mask a, gkdi_f b) { return _mm256_and_ps(a, b); }
+GKDI_OP gkdi_f gkdi_v_pick(gkdi_mask m, gkdi_f a, gkdi_f b) { return _mm256_blendv_ps(b, a, m); }
+GKDI_OP bool gkdi_v_any(gkdi_mask m) { return _mm256_movemask_ps(m) != 0; }
 GKDI_OP gkdi_f gkdi_v_rsqrt(gkdi_f a) /* relative error 3e-7 */
 {
-    gkdi_f r = gkdi_v_pair(_mm256_rsqrt_ps(a.a), _mm256_rsqrt_ps(a.b)),
-           h = gkdi_v_mul(gkdi_v_mul(a, r), gkdi_v_all(0.5f));
+    gkdi_f r = _mm256_rsqrt_ps(a), h = gkdi_v_mul(gkdi_v_mul(a, r), gkdi_v_all(0.5f));
     return gkdi_v_mul(r, gkdi_v_nmadd(h, r, gkdi_v_all(1.5f)));
 }
-GKDI_OP __m256 gkdi_v_split_exponent8(__m256 a, __m256 *out)
+/* a = 2^e (1 + out), sqrt(1/2) <= 1 + out < sqrt(2); returns e. */
+GKDI_OP gkdi_f gkdi_v_split_exponent(gkdi_f a, gkdi_f *out)
 {
     __m256i bits = _mm256_castps_si256(a), e;
     e = _mm256_srai_epi32(_mm256_sub_epi32(bits, _mm256_set1_epi32(0x3f3504f3)), 23);
     *out = _mm256_sub_ps(_mm256_castsi256_ps(_mm256_sub_epi32(bits, _mm256_slli_epi32(e, 23))), _mm256_set1_ps(1));
     return _mm256_cvtepi32_ps(e);
 }
-/* a = 2^e (1 + out), sqrt(1/2) <= 1 + out < sqrt(2); returns e. */
-GKDI_OP gkdi_f gkdi_v_split_exponent(gkdi_f v, gkdi_f *out)
+GKDI_OP float gkdi_v_sum(gkdi_f a)
 {
-    return gkdi_v_pair(gkdi_v_split_exponent8(v.a, &out->a), gkdi_v_split_exponent8(v.b, &out->b));
-}
-GKDI_OP float gkdi_v_sum(gkdi_f v)
-{
-    __m256 a = _mm256_add_ps(v.a, v.b);
     __m128 s = _mm_add_ps(_mm256_castps256_ps128(a), _mm256_extractf128_ps(a, 1));
     s = _mm_add_ps(s, _mm_movehl_ps(s, s));
     return _mm_cvtss_f32(_mm_add_ss(s, _mm_movehdup_ps(s)));
 }
-GKDI_OP __m256 gkdi_v_prefix8(__m256 a)
+/* Lane i: sum of lanes 0 .. i. */
+GKDI_OP gkdi_f gkdi_v_prefix(gkdi_f a)
 {
     a = _mm256_add_ps(a, _mm256_castsi256_ps(_mm256_slli_si256(_mm256_castps_si256(a), 4)));
     a = _mm256_add_ps(a, _mm256_castsi256_ps(_mm256_slli_si256(_mm256_castps_si256(a), 8)));
     return _mm256_add_ps(a, _mm256_permute_ps(_mm256_permute2f128_ps(a, a, 0x08), 0xff));
 }
-/* Lane i: sum of lanes 0 .. i. */
-GKDI_OP gkdi_f gkdi_v_prefix(gkdi_f v)
-{
-    __m256 a = gkdi_v_prefix8(v.a), last = _mm256_permute_ps(_mm256_permute2f128_ps(a, a, 0x11), 0xff);
-    return gkdi_v_pair(a, _mm256_add_ps(gkdi_v_prefix8(v.b), last));
-}
 GKDI_OP uint32_t gkdi_v_count_at_most(gkdi_f v, float limit)
 {
-    gkdi_f l = gkdi_v_all(limit);
-    uint32_t a = (uint32_t)_mm256_movemask_ps(_mm256_cmp_ps(v.a, l.a, _CMP_LE_OQ));
-    return (uint32_t)__builtin_popcount(a | (uint32_t)_mm256_movemask_ps(_mm256_cmp_ps(v.b, l.b, _CMP_LE_OQ)) << 8);
+    return (uint32_t)__builtin_popcount(
+        (uint32_t)_mm256_movemask_ps(_mm256_cmp_ps(v, _mm256_set1_ps(limit), _CMP_LE_OQ)));
 }
-GKDI_OP __m256 gkdi_v_power8(__m256 s)
+/* 2^t, t already rounded to units of 1/8 by adding 1.5 * 2^20: from a table without the exponent that j/8 adds. */
+GKDI_OP gkdi_f gkdi_v_power(gkdi_f s)
 {
     const __m256 table = _mm256_castsi256_ps(_mm256_setr_epi32(0x3f800000, 0x3f7b95c2, 0x3f7837f0, 0x3f75fed7,
                                                                0x3f7504f3, 0x3f75672a, 0x3f7744fd, 0x3f7ac0c7));
     __m256i y = _mm256_castps_si256(_mm256_permutevar8x32_ps(table, _mm256_castps_si256(s)));
     return _mm256_castsi256_ps(_mm256_add_epi32(y, _mm256_slli_epi32(_mm256_castps_si256(s), 20)));
 }
-/* 2^t for t <= 0: 2^(j/8) from a table without the exponent that j/8 adds, quadratic between: relative error 3.5e-6. */
+/* 2^t for t <= 0: 2^(j/8), quadratic between: relative error 3.5e-6. */
 GKDI_OP gkdi_f gkdi_v_exp2(gkdi_f t)
 {
-    gkdi_f magic = gkdi_v_all(1572864.0f), s, f, p, y; /* 1.5 * 2^20: units of 1/8 */
+    gkdi_f magic = gkdi_v_all(1572864.0f), s, f, p, y;
     t = gkdi_v_max(t, gkdi_v_all(-100));
     s = gkdi_v_add(t, magic);
     f = gkdi_v_sub(t, gkdi_v_sub(s, magic));
-    y = gkdi_v_pair(gkdi_v_power8(s.a), gkdi_v_power8(s.b));
+    y = gkdi_v_power(s);
     p = gkdi_v_madd(f, gkdi_v_all(0.240225888f), gkdi_v_all(0.693308884f));
     return gkdi_v_madd(gkdi_v_mul(f, y), p, y);
 }
@@ -4458,7 +4550,7 @@ GKDI_OP gkdi_f gkdi_v_exp2_fine(gkdi_f t)
     t = gkdi_v_max(t, gkdi_v_all(-100));
     s = gkdi_v_add(t, magic);
     f = gkdi_v_sub(t, gkdi_v_sub(s, magic));
-    y = gkdi_v_pair(gkdi_v_power8(s.a), gkdi_v_power8(s.b));
+    y = gkdi_v_power(s);
     p = gkdi_v_madd(f, gkdi_v_all(0.055496222f), gkdi_v_all(0.240257631f));
     p = gkdi_v_madd(f, p, gkdi_v_all(0.693147214f));
     return gkdi_v_madd(gkdi_v_mul(f, y), p, y);
@@ -4466,10 +4558,8 @@ GKDI_OP gkdi_f gkdi_v_exp2_fine(gkdi_f t)
 /* Lanes from the n-th on. */
 GKDI_OP gkdi_mask gkdi_v_lanes_from(uint32_t n)
 {
-    const __m256i a = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7), least = _mm256_set1_epi32((int32_t)n - 1);
-    __m256i b = _mm256_add_epi32(a, _mm256_set1_epi32(8));
-    return gkdi_v_pair(_mm256_castsi256_ps(_mm256_cmpgt_epi32(a, least)),
-                       _mm256_castsi256_ps(_mm256_cmpgt_epi32(b, least)));
+    return _mm256_castsi256_ps(
+        _mm256_cmpgt_epi32(_mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7), _mm256_set1_epi32((int32_t)n - 1)));
 }
 /* Four rows of four become columns, in both halves. */
 GKDI_OP void gkdi_v_turn4(__m256 r[4])
@@ -4484,9 +4574,9 @@ GKDI_OP void gkdi_v_turn4(__m256 r[4])
 #define GKDI_JOIN(p, q) _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p)), _mm_loadu_ps(q), 1)
 #define GKDI_TWO(p, q)                                                                                                 \
     _mm_loadh_pi(_mm_loadl_pi(_mm_setzero_ps(), (const __m64 *)(const void *)(p)), (const __m64 *)(const void *)(q))
-GKDI_OP void gkdi_v_load_lobes8(const gkd_lobe *lobes, uint32_t n, __m256 out[6])
+/* Eight lobes as columns x, y, z, kappa, weight, nearness; of fewer, the last one repeats with weight 0. */
+GKDI_OP void gkdi_v_load_lobes(const gkd_lobe *lobes, uint32_t n, gkdi_f out[6])
 {
-    const __m256i lanes = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
     const gkd_lobe *l0 = lobes, *l1 = lobes + (n > 1 ? 1 : n - 1), *l2 = lobes + (n > 2 ? 2 : n - 1);
     const gkd_lobe *l3 = lobes + (n > 3 ? 3 : n - 1), *l4 = lobes + (n > 4 ? 4 : n - 1);
     const gkd_lobe *l5 = lobes + (n > 5 ? 5 : n - 1), *l6 = lobes + (n > 6 ? 6 : n - 1);
@@ -4501,27 +4591,11 @@ GKDI_OP void gkdi_v_load_lobes8(const gkd_lobe *lobes, uint32_t n, __m256 out[6]
                              GKDI_TWO(&l4->weight, &l5->weight), 1);
     b = _mm256_insertf128_ps(_mm256_castps128_ps256(GKDI_TWO(&l2->weight, &l3->weight)),
                              GKDI_TWO(&l6->weight, &l7->weight), 1);
-    out[4] = _mm256_shuffle_ps(a, b, 0x88);
+    out[4] = _mm256_andnot_ps(gkdi_v_lanes_from(n), _mm256_shuffle_ps(a, b, 0x88));
     out[5] = _mm256_shuffle_ps(a, b, 0xdd);
-    out[4] = _mm256_and_ps(out[4], _mm256_castsi256_ps(_mm256_cmpgt_epi32(_mm256_set1_epi32((int32_t)n), lanes)));
 }
-/* Sixteen lobes as columns x, y, z, kappa, weight, nearness; of fewer, the last one repeats with weight 0. */
-GKDI_OP void gkdi_v_load_lobes(const gkd_lobe *lobes, uint32_t n, gkdi_f out[6])
-{
-    __m256 a[6], b[6];
-    uint32_t low = n < 8 ? n : 8, k = n > 8 ? 8 : n - 1;
-    gkdi_v_load_lobes8(lobes, low, a);
-    gkdi_v_load_lobes8(lobes + k, n - k, b);
-    if (n <= 8)
-        b[4] = _mm256_setzero_ps();
-    out[0] = gkdi_v_pair(a[0], b[0]);
-    out[1] = gkdi_v_pair(a[1], b[1]);
-    out[2] = gkdi_v_pair(a[2], b[2]);
-    out[3] = gkdi_v_pair(a[3], b[3]);
-    out[4] = gkdi_v_pair(a[4], b[4]);
-    out[5] = gkdi_v_pair(a[5], b[5]);
-}
-GKDI_OP void gkdi_v_load_directions8(const float *p, size_t stride, __m256 out[4])
+/* Eight directions as columns (out[3]: scratch); reads nothing past the last. */
+GKDI_OP void gkdi_v_load_directions(const float *p, size_t stride, gkdi_f out[4])
 {
     const float *q = gkdi_row(p, stride, 4), *last = gkdi_row(p, stride, 7);
     out[0] = GKDI_JOIN(p, q);
@@ -4532,77 +4606,54 @@ GKDI_OP void gkdi_v_load_directions8(const float *p, size_t stride, __m256 out[4
         _mm_movelh_ps(_mm_loadl_pi(_mm_setzero_ps(), (const __m64 *)(const void *)last), _mm_load_ss(last + 2)), 1);
     gkdi_v_turn4(out);
 }
-/* Sixteen directions as columns; reads nothing past the last. */
-GKDI_OP void gkdi_v_load_directions(const float *p, size_t stride, gkdi_f out[4])
-{
-    __m256 a[4], b[4];
-    gkdi_v_load_directions8(p, stride, a);
-    gkdi_v_load_directions8(gkdi_row(p, stride, 8), stride, b);
-    out[0] = gkdi_v_pair(a[0], b[0]);
-    out[1] = gkdi_v_pair(a[1], b[1]);
-    out[2] = gkdi_v_pair(a[2], b[2]);
-}
 GKDI_OP __m256d gkdi_v_wide(__m256 a, bool high)
 {
     return _mm256_cvtps_pd(high ? _mm256_extractf128_ps(a, 1) : _mm256_castps256_ps128(a));
 }
-GKDI_OP __m128 gkdi_v_rises4(__m256 x, __m256 y, __m256 z, const float *n, bool high)
+GKDI_OP __m128 gkdi_v_rises4(const gkdi_f d[3], const float *n, bool high)
 {
-    __m256d s = _mm256_mul_pd(gkdi_v_wide(x, high), _mm256_set1_pd((double)n[0]));
-    s = _mm256_fmadd_pd(gkdi_v_wide(y, high), _mm256_set1_pd((double)n[1]), s);
-    return _mm256_cvtpd_ps(_mm256_fmadd_pd(gkdi_v_wide(z, high), _mm256_set1_pd((double)n[2]), s));
-}
-GKDI_OP __m256 gkdi_v_rises8(__m256 x, __m256 y, __m256 z, const float *n)
-{
-    __m128 a = gkdi_v_rises4(x, y, z, n, false), b = gkdi_v_rises4(x, y, z, n, true);
-    return _mm256_insertf128_ps(_mm256_castps128_ps256(a), b, 1);
+    __m256d s = _mm256_mul_pd(gkdi_v_wide(d[0], high), _mm256_set1_pd((double)n[0]));
+    s = _mm256_fmadd_pd(gkdi_v_wide(d[1], high), _mm256_set1_pd((double)n[1]), s);
+    return _mm256_cvtpd_ps(_mm256_fmadd_pd(gkdi_v_wide(d[2], high), _mm256_set1_pd((double)n[2]), s));
 }
 /* Cosines with one normal, by doubles. */
 GKDI_OP gkdi_f gkdi_v_rises(const gkdi_f d[3], const float *n)
 {
-    return gkdi_v_pair(gkdi_v_rises8(d[0].a, d[1].a, d[2].a, n), gkdi_v_rises8(d[0].b, d[1].b, d[2].b, n));
+    __m128 a = gkdi_v_rises4(d, n, false), b = gkdi_v_rises4(d, n, true);
+    return _mm256_insertf128_ps(_mm256_castps128_ps256(a), b, 1);
 }
 #elif GKDI_NEON
 #define GKDI_WIDE
 #define GKDI_OP __attribute__((always_inline)) static inline
 typedef struct gkdi_f {
-    float32x4_t a, b, c, d;
+    float32x4_t a, b;
 } gkdi_f;
-typedef struct gkdi_n {
-    int32x4_t a, b, c, d;
-} gkdi_n;
 typedef struct gkdi_mask {
-    uint32x4_t a, b, c, d;
+    uint32x4_t a, b;
 } gkdi_mask;
-/* Function name(x, y, ...) of type from op on quarters. */
-#define GKDI_QUARTERS1(type, name, op, t)                                                                              \
+/* Function name(x, ...) of type from op on halves. */
+#define GKDI_HALVES1(type, name, op, t)                                                                                \
     GKDI_OP type name(t x)                                                                                             \
     {                                                                                                                  \
         type v;                                                                                                        \
         v.a = op(x.a);                                                                                                 \
         v.b = op(x.b);                                                                                                 \
-        v.c = op(x.c);                                                                                                 \
-        v.d = op(x.d);                                                                                                 \
         return v;                                                                                                      \
     }
-#define GKDI_QUARTERS2(type, name, op, t)                                                                              \
+#define GKDI_HALVES2(type, name, op, t)                                                                                \
     GKDI_OP type name(t x, t y)                                                                                        \
     {                                                                                                                  \
         type v;                                                                                                        \
         v.a = op(x.a, y.a);                                                                                            \
         v.b = op(x.b, y.b);                                                                                            \
-        v.c = op(x.c, y.c);                                                                                            \
-        v.d = op(x.d, y.d);                                                                                            \
         return v;                                                                                                      \
     }
-#define GKDI_QUARTERS3(name, op, t)                                                                                    \
+#define GKDI_HALVES3(name, op, t)                                                                                      \
     GKDI_OP gkdi_f name(t x, gkdi_f y, gkdi_f z)                                                                       \
     {                                                                                                                  \
         gkdi_f v;                                                                                                      \
         v.a = op(x.a, y.a, z.a);                                                                                       \
         v.b = op(x.b, y.b, z.b);                                                                                       \
-        v.c = op(x.c, y.c, z.c);                                                                                       \
-        v.d = op(x.d, y.d, z.d);                                                                                       \
         return v;                                                                                                      \
     }
 GKDI_OP gkdi_f gkdi_v_load(const float *p)
@@ -4610,58 +4661,35 @@ GKDI_OP gkdi_f gkdi_v_load(const float *p)
     gkdi_f v;
     v.a = vld1q_f32(p);
     v.b = vld1q_f32(p + 4);
-    v.c = vld1q_f32(p + 8);
-    v.d = vld1q_f32(p + 12);
     return v;
 }
 GKDI_OP void gkdi_v_store(float *p, gkdi_f v)
 {
     vst1q_f32(p, v.a);
     vst1q_f32(p + 4, v.b);
-    vst1q_f32(p + 8, v.c);
-    vst1q_f32(p + 12, v.d);
 }
 GKDI_OP gkdi_f gkdi_v_all(float a)
 {
     gkdi_f v;
-    v.a = v.b = v.c = v.d = vdupq_n_f32(a);
+    v.a = v.b = vdupq_n_f32(a);
     return v;
 }
-GKDI_QUARTERS2(gkdi_f, gkdi_v_add, vaddq_f32, gkdi_f)
-GKDI_QUARTERS2(gkdi_f, gkdi_v_sub, vsubq_f32, gkdi_f)
-GKDI_QUARTERS2(gkdi_f, gkdi_v_mul, vmulq_f32, gkdi_f)
-GKDI_QUARTERS2(gkdi_f, gkdi_v_div, vdivq_f32, gkdi_f)
-GKDI_QUARTERS2(gkdi_f, gkdi_v_min, vminnmq_f32, gkdi_f) /* y where x is NaN */
-GKDI_QUARTERS2(gkdi_f, gkdi_v_max, vmaxnmq_f32, gkdi_f)
-GKDI_QUARTERS2(gkdi_mask, gkdi_v_less, vcltq_f32, gkdi_f)
-GKDI_QUARTERS2(gkdi_mask, gkdi_v_both, vandq_u32, gkdi_mask)
-GKDI_QUARTERS1(gkdi_f, gkdi_v_sqrt, vsqrtq_f32, gkdi_f)
+GKDI_HALVES2(gkdi_f, gkdi_v_add, vaddq_f32, gkdi_f)
+GKDI_HALVES2(gkdi_f, gkdi_v_sub, vsubq_f32, gkdi_f)
+GKDI_HALVES2(gkdi_f, gkdi_v_mul, vmulq_f32, gkdi_f)
+GKDI_HALVES2(gkdi_f, gkdi_v_div, vdivq_f32, gkdi_f)
+GKDI_HALVES2(gkdi_f, gkdi_v_min, vminnmq_f32, gkdi_f) /* y where x is NaN */
+GKDI_HALVES2(gkdi_f, gkdi_v_max, vmaxnmq_f32, gkdi_f)
+GKDI_HALVES2(gkdi_mask, gkdi_v_less, vcltq_f32, gkdi_f)
+GKDI_HALVES2(gkdi_mask, gkdi_v_both, vandq_u32, gkdi_mask)
+GKDI_HALVES1(gkdi_f, gkdi_v_sqrt, vsqrtq_f32, gkdi_f)
 #define GKDI_MADD4(x, y, z) vfmaq_f32(z, x, y)
 #define GKDI_NMADD4(x, y, z) vfmsq_f32(z, x, y)
-GKDI_QUARTERS3(gkdi_v_madd, GKDI_MADD4, gkdi_f)
-GKDI_QUARTERS3(gkdi_v_nmadd, GKDI_NMADD4, gkdi_f)
-GKDI_QUARTERS3(gkdi_v_pick, vbslq_f32, gkdi_mask)
+GKDI_HALVES3(gkdi_v_madd, GKDI_MADD4, gkdi_f)
+GKDI_HALVES3(gkdi_v_nmadd, GKDI_NMADD4, gkdi_f)
+GKDI_HALVES3(gkdi_v_pick, vbslq_f32, gkdi_mask)
 GKDI_OP gkdi_f gkdi_v_where(gkdi_mask m, gkdi_f x) { return gkdi_v_pick(m, x, gkdi_v_all(0)); }
-GKDI_OP bool gkdi_v_any(gkdi_mask m) { return vmaxvq_u32(vorrq_u32(vorrq_u32(m.a, m.b), vorrq_u32(m.c, m.d))) != 0; }
-#define GKDI_ODD4(x) vtstq_s32(x, vdupq_n_s32(1))
-#define GKDI_NEXT4(x) vaddq_s32(x, vdupq_n_s32(1))
-GKDI_QUARTERS1(gkdi_mask, gkdi_v_odd, GKDI_ODD4, gkdi_n)
-GKDI_QUARTERS1(gkdi_n, gkdi_v_next, GKDI_NEXT4, gkdi_n)
-GKDI_QUARTERS1(gkdi_f, gkdi_v_float, vcvtq_f32_s32, gkdi_n)
-GKDI_QUARTERS1(gkdi_n, gkdi_v_truncate, vcvtq_s32_f32, gkdi_f)
-GKDI_OP float32x4_t gkdi_v_negate_two4(float32x4_t x, int32x4_t k)
-{
-    int32x4_t sign = vshlq_n_s32(vandq_s32(k, vdupq_n_s32(2)), 30);
-    return vreinterpretq_f32_s32(veorq_s32(vreinterpretq_s32_f32(x), sign));
-}
-GKDI_OP gkdi_f gkdi_v_negate_two(gkdi_f x, gkdi_n k) /* where k & 2 */
-{
-    x.a = gkdi_v_negate_two4(x.a, k.a);
-    x.b = gkdi_v_negate_two4(x.b, k.b);
-    x.c = gkdi_v_negate_two4(x.c, k.c);
-    x.d = gkdi_v_negate_two4(x.d, k.d);
-    return x;
-}
+GKDI_OP bool gkdi_v_any(gkdi_mask m) { return vmaxvq_u32(vorrq_u32(m.a, m.b)) != 0; }
 GKDI_OP gkdi_f gkdi_v_rsqrt(gkdi_f x) { return gkdi_v_div(gkdi_v_all(1), gkdi_v_sqrt(x)); }
 GKDI_OP float32x4_t gkdi_v_split_exponent4(float32x4_t x, float32x4_t *out)
 {
@@ -4675,11 +4703,9 @@ GKDI_OP gkdi_f gkdi_v_split_exponent(gkdi_f x, gkdi_f *out)
     gkdi_f e;
     e.a = gkdi_v_split_exponent4(x.a, &out->a);
     e.b = gkdi_v_split_exponent4(x.b, &out->b);
-    e.c = gkdi_v_split_exponent4(x.c, &out->c);
-    e.d = gkdi_v_split_exponent4(x.d, &out->d);
     return e;
 }
-GKDI_OP float gkdi_v_sum(gkdi_f v) { return vaddvq_f32(vaddq_f32(vaddq_f32(v.a, v.b), vaddq_f32(v.c, v.d))); }
+GKDI_OP float gkdi_v_sum(gkdi_f v) { return vaddvq_f32(vaddq_f32(v.a, v.b)); }
 GKDI_OP float32x4_t gkdi_v_prefix4(float32x4_t a, float before)
 {
     float32x4_t zero = vdupq_n_f32(0);
@@ -4692,21 +4718,18 @@ GKDI_OP gkdi_f gkdi_v_prefix(gkdi_f v)
 {
     v.a = gkdi_v_prefix4(v.a, 0);
     v.b = gkdi_v_prefix4(v.b, vgetq_lane_f32(v.a, 3));
-    v.c = gkdi_v_prefix4(v.c, vgetq_lane_f32(v.b, 3));
-    v.d = gkdi_v_prefix4(v.d, vgetq_lane_f32(v.c, 3));
     return v;
 }
 #define GKDI_AT_MOST4(x) vshrq_n_u32(vcleq_f32(x, l), 31)
 GKDI_OP uint32_t gkdi_v_count_at_most(gkdi_f v, float limit)
 {
     float32x4_t l = vdupq_n_f32(limit);
-    return vaddvq_u32(vaddq_u32(vaddq_u32(GKDI_AT_MOST4(v.a), GKDI_AT_MOST4(v.b)),
-                                vaddq_u32(GKDI_AT_MOST4(v.c), GKDI_AT_MOST4(v.d))));
+    return vaddvq_u32(vaddq_u32(GKDI_AT_MOST4(v.a), GKDI_AT_MOST4(v.b)));
 }
 /* Lanes from the n-th on. */
 GKDI_OP gkdi_mask gkdi_v_lanes_from(uint32_t n)
 {
-    static const float lanes[16] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+    static const float lanes[8] = {0, 1, 2, 3, 4, 5, 6, 7};
     return gkdi_v_less(gkdi_v_all((float)n - 0.5f), gkdi_v_load(lanes));
 }
 /* As gkd_exp2. */
@@ -4724,14 +4747,14 @@ GKDI_OP float32x4_t gkdi_v_exp2_4(float32x4_t t)
     p = vfmaq_f32(vdupq_n_f32(1), f, p);
     return vreinterpretq_f32_s32(vaddq_s32(vreinterpretq_s32_f32(p), vshlq_n_s32(n, 23)));
 }
-GKDI_QUARTERS1(gkdi_f, gkdi_v_exp2, gkdi_v_exp2_4, gkdi_f)
+GKDI_HALVES1(gkdi_f, gkdi_v_exp2, gkdi_v_exp2_4, gkdi_f)
 GKDI_OP gkdi_f gkdi_v_exp2_fine(gkdi_f t) { return gkdi_v_exp2(t); }
-/* Sixteen lobes as columns x, y, z, kappa, weight, nearness; of fewer, the last one repeats with weight 0. */
+/* Eight lobes as columns x, y, z, kappa, weight, nearness; of fewer, the last one repeats with weight 0. */
 GKDI_OP void gkdi_v_load_lobes(const gkd_lobe *lobes, uint32_t n, gkdi_f out[6])
 {
-    float column[6][16];
+    float column[6][8];
     uint32_t i, k;
-    for (i = 0; i < 16; ++i) {
+    for (i = 0; i < 8; ++i) {
         const gkd_lobe *p = lobes + (i < n ? i : n - 1);
         for (k = 0; k < 3; ++k)
             column[k][i] = p->mean[k];
@@ -4742,12 +4765,12 @@ GKDI_OP void gkdi_v_load_lobes(const gkd_lobe *lobes, uint32_t n, gkdi_f out[6])
     for (k = 0; k < 6; ++k)
         out[k] = gkdi_v_load(column[k]);
 }
-/* Sixteen directions as columns. */
+/* Eight directions as columns. */
 GKDI_OP void gkdi_v_load_directions(const float *p, size_t stride, gkdi_f out[4])
 {
-    float column[3][16];
+    float column[3][8];
     uint32_t i, k;
-    for (i = 0; i < 16; ++i)
+    for (i = 0; i < 8; ++i)
         for (k = 0; k < 3; ++k)
             column[k][i] = gkdi_row(p, stride, i)[k];
     for (k = 0; k < 3; ++k)
@@ -4769,8 +4792,6 @@ GKDI_OP gkdi_f gkdi_v_rises(const gkdi_f d[3], const float *n)
     gkdi_f v;
     v.a = gkdi_v_rises4(d[0].a, d[1].a, d[2].a, n);
     v.b = gkdi_v_rises4(d[0].b, d[1].b, d[2].b, n);
-    v.c = gkdi_v_rises4(d[0].c, d[1].c, d[2].c, n);
-    v.d = gkdi_v_rises4(d[0].d, d[1].d, d[2].d, n);
     return v;
 }
 #endif
@@ -4790,7 +4811,7 @@ GKDI_OP gkdi_f gkdi_v_dot(gkdi_f ax, gkdi_f ay, gkdi_f az, gkdi_f bx, gkdi_f by,
 GKDI_OP gkdi_f gkdi_pdf_lanes(const gkd_handle *handle, const float d[3])
 {
     gkdi_f x = gkdi_v_all(d[0]), y = gkdi_v_all(d[1]), z = gkdi_v_all(d[2]), sum = gkdi_v_all(0), lift;
-    uint32_t i, blocks = (handle->count + 15) / 16;
+    uint32_t i, blocks = (handle->count + 7) / 8;
     bool surface = handle->surface != 0;
     float c = surface ? gkd_dot(d, handle->normal) : 1;
     if (!(c > 0))
@@ -4816,6 +4837,8 @@ GKDI_OP float gkdi_pdf_inline(const gkd_handle *handle, const float d[3])
     return (1 - e) * gkdi_v_sum(gkdi_pdf_lanes(handle, d)) + e * (1 / (4 * GKD_PI));
 }
 
+GKDI_WIDE static float gkdi_pdf_wide(const gkd_handle *handle, const float *d) { return gkdi_pdf_inline(handle, d); }
+
 GKDI_WIDE static void gkdi_pdf_batch_wide(uint32_t count, const uint32_t *index, const gkd_handle *handles,
                                           const float *directions, size_t stride, float *pdf)
 {
@@ -4826,19 +4849,19 @@ GKDI_WIDE static void gkdi_pdf_batch_wide(uint32_t count, const uint32_t *index,
     }
 }
 
-/* Sixteen directions of one handle without a surface; lanes are directions. */
+/* Eight directions of one handle without a surface; lanes are directions. */
 GKDI_OP gkdi_f gkdi_pdf_sphere(const gkd_handle *handle, const gkdi_f d[3])
 {
     gkdi_f sum = gkdi_v_all(0);
     uint32_t k, l, end;
-    for (k = 0; k < handle->count; k += 16) {
-        const float *b = (const float *)(const void *)&handle->block[k / 16]; /* columns are 16 apart */
-        end = handle->count - k < 16 ? handle->count - k : 16;
+    for (k = 0; k < handle->count; k += 8) {
+        const float *b = (const float *)(const void *)&handle->block[k / 8]; /* columns are 8 apart */
+        end = handle->count - k < 8 ? handle->count - k : 8;
         for (l = 0; l < end; ++l, ++b) {
-            gkdi_f x = gkdi_v_sub(d[0], gkdi_v_all(b[0])), y = gkdi_v_sub(d[1], gkdi_v_all(b[16])),
-                   z = gkdi_v_sub(d[2], gkdi_v_all(b[32]));
-            x = gkdi_v_mul(gkdi_v_dot(x, y, z, x, y, z), gkdi_v_all(-b[48]));
-            sum = gkdi_v_madd(gkdi_v_exp2(x), gkdi_v_all(b[80]), sum);
+            gkdi_f x = gkdi_v_sub(d[0], gkdi_v_all(b[0])), y = gkdi_v_sub(d[1], gkdi_v_all(b[8])),
+                   z = gkdi_v_sub(d[2], gkdi_v_all(b[16]));
+            x = gkdi_v_mul(gkdi_v_dot(x, y, z, x, y, z), gkdi_v_all(-b[24]));
+            sum = gkdi_v_madd(gkdi_v_exp2(x), gkdi_v_all(b[40]), sum);
         }
     }
     return sum;
@@ -4849,30 +4872,30 @@ GKDI_OP gkdi_f gkdi_pdf_above(const gkd_handle *handle, const gkdi_f d[3], gkdi_
 {
     gkdi_f sum = gkdi_v_all(0);
     uint32_t k, l, end;
-    for (k = 0; k < handle->count; k += 16) {
-        const float *b = (const float *)(const void *)&handle->block[k / 16];
-        end = handle->count - k < 16 ? handle->count - k : 16;
+    for (k = 0; k < handle->count; k += 8) {
+        const float *b = (const float *)(const void *)&handle->block[k / 8];
+        end = handle->count - k < 8 ? handle->count - k : 8;
         for (l = 0; l < end; ++l, ++b) {
-            gkdi_f x = gkdi_v_sub(d[0], gkdi_v_all(b[0])), y = gkdi_v_sub(d[1], gkdi_v_all(b[16])),
-                   z = gkdi_v_sub(d[2], gkdi_v_all(b[32])), p;
-            x = gkdi_v_mul(gkdi_v_dot(x, y, z, x, y, z), gkdi_v_all(-b[48]));
+            gkdi_f x = gkdi_v_sub(d[0], gkdi_v_all(b[0])), y = gkdi_v_sub(d[1], gkdi_v_all(b[8])),
+                   z = gkdi_v_sub(d[2], gkdi_v_all(b[16])), p;
+            x = gkdi_v_mul(gkdi_v_dot(x, y, z, x, y, z), gkdi_v_all(-b[24]));
             p = gkdi_v_exp2(x);
-            if (gkdi_v_any(gkdi_v_less(gkdi_v_mul(least, gkdi_v_all(b[64])), gkdi_v_all(26))))
-                p = gkdi_v_add(p, gkdi_v_exp2(gkdi_v_nmadd(c, gkdi_v_all(b[64]), x)));
-            sum = gkdi_v_madd(p, gkdi_v_all(b[80]), sum);
+            if (gkdi_v_any(gkdi_v_less(gkdi_v_mul(least, gkdi_v_all(b[32])), gkdi_v_all(26))))
+                p = gkdi_v_add(p, gkdi_v_exp2(gkdi_v_nmadd(c, gkdi_v_all(b[32]), x)));
+            sum = gkdi_v_madd(p, gkdi_v_all(b[40]), sum);
         }
     }
     return sum;
 }
 
-/* One handle, count directions, a multiple of 16. */
+/* One handle, count directions, a multiple of 8. */
 GKDI_WIDE static void gkdi_pdf_same_wide(const gkd_handle *handle, uint32_t count, const float *directions,
                                          size_t stride, float *pdf)
 {
     const float *n = handle->normal, e = handle->uniform;
     bool surface = handle->surface != 0;
     uint32_t i;
-    for (i = 0; i < count; i += 16) {
+    for (i = 0; i < count; i += 8) {
         gkdi_f d[4], sum;
         gkdi_v_load_directions(gkdi_row(directions, stride, i), stride, d);
         if (surface) {
@@ -4902,47 +4925,77 @@ GKDI_512_OP __m512 gkdi_exp2_512(__m512 t)
     return _mm512_maskz_scalef_ps(0xffff, p, t);
 }
 
+/* Sixteen directions as columns; packed ones (stride 12) by two permutations a column. */
+GKDI_512_OP void gkdi_load_directions_512(const float *p, size_t stride, __m512 out[3])
+{
+    const __m512i lanes = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    gkdi_f a[4], b[4];
+    int k;
+    if (stride == 12) {
+        __m512 low = _mm512_loadu_ps(p), middle = _mm512_loadu_ps(p + 16), high = _mm512_loadu_ps(p + 32);
+        for (k = 0; k < 3; ++k) {
+            __m512i at = _mm512_add_epi32(_mm512_mullo_epi32(lanes, _mm512_set1_epi32(3)), _mm512_set1_epi32(k));
+            __mmask16 last = _mm512_cmp_epi32_mask(at, _mm512_set1_epi32(32), _MM_CMPINT_NLT);
+            __m512i then = _mm512_mask_sub_epi32(lanes, last, at, _mm512_set1_epi32(16));
+            out[k] = _mm512_permutex2var_ps(_mm512_permutex2var_ps(low, at, middle), then, high);
+        }
+        return;
+    }
+    gkdi_v_load_directions(p, stride, a);
+    gkdi_v_load_directions(gkdi_row(p, stride, 8), stride, b);
+    for (k = 0; k < 3; ++k)
+        out[k] = _mm512_insertf32x8(_mm512_castps256_ps512(a[k]), b[k], 1);
+}
+
+/* gkdi_v_rises. */
+GKDI_512_OP __m512 gkdi_rises_512(const __m512 d[3], const float *n)
+{
+    __m256 half[2][3];
+    int k;
+    for (k = 0; k < 3; ++k) {
+        half[0][k] = _mm512_castps512_ps256(d[k]);
+        half[1][k] = _mm512_extractf32x8_ps(d[k], 1);
+    }
+    return _mm512_insertf32x8(_mm512_castps256_ps512(gkdi_v_rises(half[0], n)), gkdi_v_rises(half[1], n), 1);
+}
+
 /* gkdi_pdf_sphere or, with a surface, gkdi_pdf_above. */
 GKDI_512_OP __m512 gkdi_pdf_sum_512(const gkd_handle *handle, const __m512 d[3], __m512 c, __m512 least, bool surface)
 {
     __m512 sum = _mm512_setzero_ps();
     uint32_t k, l, end;
-    for (k = 0; k < handle->count; k += 16) {
-        const float *b = (const float *)(const void *)&handle->block[k / 16];
-        end = handle->count - k < 16 ? handle->count - k : 16;
+    for (k = 0; k < handle->count; k += 8) {
+        const float *b = (const float *)(const void *)&handle->block[k / 8];
+        end = handle->count - k < 8 ? handle->count - k : 8;
         for (l = 0; l < end; ++l, ++b) {
-            __m512 x = _mm512_sub_ps(d[0], _mm512_set1_ps(b[0])), y = _mm512_sub_ps(d[1], _mm512_set1_ps(b[16]));
-            __m512 z = _mm512_sub_ps(d[2], _mm512_set1_ps(b[32])), lift, p;
+            __m512 x = _mm512_sub_ps(d[0], _mm512_set1_ps(b[0])), y = _mm512_sub_ps(d[1], _mm512_set1_ps(b[8]));
+            __m512 z = _mm512_sub_ps(d[2], _mm512_set1_ps(b[16])), lift, p;
             x = _mm512_fmadd_ps(x, x, _mm512_fmadd_ps(y, y, _mm512_mul_ps(z, z)));
-            x = _mm512_fnmadd_ps(x, _mm512_set1_ps(b[48]), _mm512_setzero_ps());
+            x = _mm512_fnmadd_ps(x, _mm512_set1_ps(b[24]), _mm512_setzero_ps());
             p = gkdi_exp2_512(x);
             if (surface) {
-                lift = _mm512_set1_ps(b[64]);
+                lift = _mm512_set1_ps(b[32]);
                 if (_mm512_cmp_ps_mask(_mm512_mul_ps(least, lift), _mm512_set1_ps(26), _CMP_LT_OQ))
                     p = _mm512_add_ps(p, gkdi_exp2_512(_mm512_fnmadd_ps(c, lift, x)));
             }
-            sum = _mm512_fmadd_ps(p, _mm512_set1_ps(b[80]), sum);
+            sum = _mm512_fmadd_ps(p, _mm512_set1_ps(b[40]), sum);
         }
     }
     return sum;
 }
 
-/* gkdi_pdf_same_wide. */
+/* gkdi_pdf_same_wide, a multiple of 16. */
 GKDI_512 static void gkdi_pdf_same_512(const gkd_handle *handle, uint32_t count, const float *directions, size_t stride,
                                        float *pdf)
 {
     const float e = handle->uniform;
-    uint32_t i, k;
+    uint32_t i;
     for (i = 0; i < count; i += 16) {
-        gkdi_f rows[4], rise;
         __m512 d[3], sum, c = _mm512_setzero_ps();
         __mmask16 above;
-        gkdi_v_load_directions(gkdi_row(directions, stride, i), stride, rows);
-        for (k = 0; k < 3; ++k)
-            d[k] = _mm512_insertf32x8(_mm512_castps256_ps512(rows[k].a), rows[k].b, 1);
+        gkdi_load_directions_512(gkdi_row(directions, stride, i), stride, d);
         if (handle->surface) {
-            rise = gkdi_v_rises(rows, handle->normal);
-            c = _mm512_insertf32x8(_mm512_castps256_ps512(rise.a), rise.b, 1);
+            c = gkdi_rises_512(d, handle->normal);
             above = _mm512_cmp_ps_mask(c, _mm512_setzero_ps(), _CMP_GT_OQ);
             sum = gkdi_pdf_sum_512(handle, d, c, _mm512_mask_blend_ps(above, _mm512_set1_ps(2), c), true);
             sum = _mm512_maskz_mov_ps(above, sum);
@@ -5069,71 +5122,75 @@ GKDI_OP void gkdi_tilt_lobes(gkd_lobe_block *b, const float *normal)
     gkdi_v_store(b->lift, gkdi_v_mul(gkdi_v_mul(k, gkdi_v_all(2 * GKD_LOG2E)), gkdi_v_max(r, gkdi_v_all(0))));
 }
 
-/* Scale, sums of weights, falloff. */
-GKDI_OP void gkdi_finish_lobes(gkd_handle *handle, bool product)
+/* Up to eight lobes of a handle. Handles have few lobes, but how few cannot be predicted: so steps go over all parts of
+   a group. */
+typedef struct gkdi_part {
+    gkd_lobe_block *block;
+    const gkd_lobe *lobes;
+    uint32_t of, left; /* handle; lobes from here on */
+} gkdi_part;
+
+/* Scale, sums of weights, falloff. inverse: of the handle's sum; before: sum of the parts before, adds this one's. */
+GKDI_OP void gkdi_finish_lobes(gkd_lobe_block *b, uint32_t left, float inverse, float *before)
 {
-    uint32_t i, count = handle->count, blocks = (count + 15) / 16;
-    gkdi_f total = gkdi_v_all(0);
-    float sum;
-    for (i = 0; i < blocks; ++i)
-        total = gkdi_v_add(total, gkdi_v_load(handle->block[i].upper));
-    sum = gkdi_v_sum(total);
-    if (!(sum > GKD_DIM)) {
-        gkd_set_plain(handle, product);
-        gkd_finish_lobes(handle, 1);
-        return;
-    }
-    total = gkdi_v_all(1 / sum);
-    sum = 0;
-    for (i = 0; i < blocks; ++i) {
-        gkd_lobe_block *b = &handle->block[i];
-        gkdi_f k = gkdi_v_load(b->falloff), w = gkdi_v_mul(gkdi_v_load(b->upper), total), m, upper;
-        m = gkdi_v_mul(gkdi_v_all(2 * GKD_PI), gkdi_one_minus_exp(gkdi_v_add(k, k)));
-        gkdi_v_store(b->scale, gkdi_v_div(gkdi_v_mul(w, k), m));
-        gkdi_v_store(b->falloff, gkdi_v_mul(k, gkdi_v_all(0.5f * GKD_LOG2E)));
-        upper = gkdi_v_add(gkdi_v_prefix(w), gkdi_v_all(sum));
-        if (i + 1 < blocks)
-            sum += gkdi_v_sum(w);
-        else
-            upper = gkdi_v_pick(gkdi_v_lanes_from(count - 1 - i * 16), gkdi_v_all(1), upper);
-        gkdi_v_store(b->upper, upper);
-    }
+    gkdi_f k = gkdi_v_load(b->falloff), w = gkdi_v_mul(gkdi_v_load(b->upper), gkdi_v_all(inverse)), m, upper;
+    m = gkdi_v_mul(gkdi_v_all(2 * GKD_PI), gkdi_one_minus_exp(gkdi_v_add(k, k)));
+    gkdi_v_store(b->scale, gkdi_v_div(gkdi_v_mul(w, k), m));
+    gkdi_v_store(b->falloff, gkdi_v_mul(k, gkdi_v_all(0.5f * GKD_LOG2E)));
+    upper = gkdi_v_add(gkdi_v_prefix(w), gkdi_v_all(*before));
+    gkdi_v_store(b->upper, gkdi_v_pick(gkdi_v_lanes_from(left - 1), gkdi_v_all(1), upper));
+    *before += gkdi_v_sum(w);
 }
 
 /* gkd_orient_lobes_as of up to GKDI_GROUP handles. */
 GKDI_WIDE static void gkdi_orient_wide(uint32_t count, const gkdi_view_from *from, bool product)
 {
-    float offset[GKDI_GROUP][3];
+    float offset[GKDI_GROUP][3], sum[GKDI_GROUP], inverse[GKDI_GROUP], before[GKDI_GROUP];
     bool surface[GKDI_GROUP];
-    uint32_t i, k;
+    gkdi_part part[GKDI_GROUP * GKD_MAX_LOBES / 8];
+    uint32_t i, k, n = 0;
     for (i = 0; i < count; ++i) {
-        surface[i] = gkd_place_handle(from[i].handle, from[i].pivot, from[i].position, from[i].normal, offset[i]);
-        from[i].handle->count = from[i].count;
-        for (k = 0; k < from[i].count; k += 2) /* 48 bytes */
-            __builtin_prefetch(from[i].lobes + k);
+        gkd_handle *h = from[i].handle;
+        surface[i] = gkd_place_handle(h, from[i].pivot, from[i].position, from[i].normal, offset[i]);
+        h->count = from[i].count;
+        sum[i] = before[i] = 0;
+        for (k = 0; k < h->count; k += 8, ++n) {
+            part[n].block = &h->block[k / 8];
+            part[n].lobes = from[i].lobes + k;
+            part[n].of = i;
+            part[n].left = h->count - k;
+            GKDI_PREFETCH(part[n].lobes);
+            GKDI_PREFETCH((const char *)part[n].lobes + 64);
+            GKDI_PREFETCH((const char *)part[n].lobes + 128);
+        }
+    }
+    for (k = 0; k < n; ++k)
+        gkdi_turn_lobes(part[k].block, part[k].lobes, part[k].left, offset[part[k].of]);
+    for (k = 0; k < n; ++k)
+        if (surface[part[k].of])
+            gkdi_weigh_lobes(part[k].block, from[part[k].of].handle->normal, product);
+        else
+            gkdi_v_store(part[k].block->lift, gkdi_v_all(0));
+    for (k = 0; k < n; ++k) {
+        if (surface[part[k].of])
+            gkdi_tilt_lobes(part[k].block, from[part[k].of].handle->normal);
+        sum[part[k].of] += gkdi_v_sum(gkdi_v_load(part[k].block->upper));
     }
     for (i = 0; i < count; ++i)
-        for (k = 0; k < from[i].count; k += 16)
-            gkdi_turn_lobes(&from[i].handle->block[k / 16], from[i].lobes + k, from[i].count - k, offset[i]);
+        inverse[i] = 1 / sum[i];
+    for (k = 0; k < n; ++k)
+        gkdi_finish_lobes(part[k].block, part[k].left, inverse[part[k].of], &before[part[k].of]);
     for (i = 0; i < count; ++i)
-        for (k = 0; surface[i] && k < from[i].count; k += 16)
-            gkdi_weigh_lobes(&from[i].handle->block[k / 16], from[i].handle->normal, product);
-    for (i = 0; i < count; ++i)
-        for (k = 0; k < from[i].count; k += 16) {
-            if (surface[i])
-                gkdi_tilt_lobes(&from[i].handle->block[k / 16], from[i].handle->normal);
-            else
-                gkdi_v_store(from[i].handle->block[k / 16].lift, gkdi_v_all(0));
+        if (!(sum[i] > GKD_DIM)) {
+            gkd_set_plain(from[i].handle, product);
+            gkd_finish_lobes(from[i].handle, 1);
         }
-    for (i = 0; i < count; ++i)
-        gkdi_finish_lobes(from[i].handle, product);
 }
 
 /* Columns of draws. */
 #define GKDI_DRAWS 64
 typedef struct gkdi_draws {
     float mean[3][GKDI_DRAWS], kappa[GKDI_DRAWS], normal[3][GKDI_DRAWS], r[GKDI_DRAWS], turn[GKDI_DRAWS];
-    float out[3][GKDI_DRAWS];
 } gkdi_draws;
 
 /* gkd_minus_log1m. */
@@ -5151,44 +5208,31 @@ GKDI_OP gkdi_f gkdi_minus_log1m(gkdi_f y)
     return gkdi_v_nmadd(exponent, gkdi_v_all(GKD_LN2), gkdi_v_sub(zero, p));
 }
 
-/* gkd_circle. */
-GKDI_OP void gkdi_circle(gkdi_f u, gkdi_f *sine, gkdi_f *cosine)
+/* gkd_sine. */
+GKDI_OP gkdi_f gkdi_sine(gkdi_f x)
 {
-    gkdi_f f = gkdi_v_mul(u, gkdi_v_all(4)), x, s, c, q;
-    gkdi_n k = gkdi_v_truncate(gkdi_v_add(f, gkdi_v_all(0.5f)));
-    gkdi_mask odd = gkdi_v_odd(k);
-    x = gkdi_v_mul(gkdi_v_sub(f, gkdi_v_float(k)), gkdi_v_all(GKD_PI / 2));
-    q = gkdi_v_mul(x, x);
-    s = gkdi_v_madd(q, gkdi_v_all(-1.0f / 5040), gkdi_v_all(1.0f / 120));
-    s = gkdi_v_madd(q, s, gkdi_v_all(-1.0f / 6));
-    s = gkdi_v_mul(x, gkdi_v_madd(q, s, gkdi_v_all(1)));
-    c = gkdi_v_madd(q, gkdi_v_all(1.0f / 40320), gkdi_v_all(-1.0f / 720));
-    c = gkdi_v_madd(q, c, gkdi_v_all(1.0f / 24));
-    c = gkdi_v_madd(q, c, gkdi_v_all(-1.0f / 2));
-    c = gkdi_v_madd(q, c, gkdi_v_all(1));
-    *sine = gkdi_v_negate_two(gkdi_v_pick(odd, c, s), k);
-    *cosine = gkdi_v_negate_two(gkdi_v_pick(odd, s, c), gkdi_v_next(k));
+    gkdi_f q = gkdi_v_mul(x, x), p = gkdi_v_madd(q, gkdi_v_all(39.536707f), gkdi_v_all(-76.549782f));
+    p = gkdi_v_madd(q, p, gkdi_v_all(81.601004f));
+    p = gkdi_v_madd(q, p, gkdi_v_all(-41.341655f));
+    return gkdi_v_mul(x, gkdi_v_madd(q, p, gkdi_v_all(6.2831852f)));
 }
 
-/* gkd_draw_direction of sixteen draws from lane i on. */
-GKDI_WIDE static void gkdi_draw_directions(gkdi_draws *d, uint32_t i)
+/* gkd_draw_direction of eight draws: in m means, out directions; n normals. */
+GKDI_OP void gkdi_draw_directions(gkdi_f m[3], const gkdi_f n[3], gkdi_f k, gkdi_f r, gkdi_f turn)
 {
-    gkdi_f m[3], n[3], w[3], one = gkdi_v_all(1), zero = gkdi_v_all(0), v, s, c, radius, sign, a, b, k;
+    gkdi_f w[3], one = gkdi_v_all(1), zero = gkdi_v_all(0), v, s, c, radius, sign, a, b;
     uint32_t j;
-    for (j = 0; j < 3; ++j) {
-        m[j] = gkdi_v_load(d->mean[j] + i);
-        n[j] = gkdi_v_load(d->normal[j] + i);
-    }
-    k = gkdi_v_load(d->kappa + i);
-    v = gkdi_v_mul(gkdi_v_bound(gkdi_v_load(d->r + i), 0, 0.99999994f), gkdi_one_minus_exp(gkdi_v_add(k, k)));
+    v = gkdi_v_mul(gkdi_v_bound(r, 0, 0.99999994f), gkdi_one_minus_exp(gkdi_v_add(k, k)));
     v = gkdi_v_bound(gkdi_v_div(gkdi_minus_log1m(v), k), 0, 2);
     sign = gkdi_v_pick(gkdi_v_less(m[2], zero), gkdi_v_all(-1), one);
     a = gkdi_v_div(gkdi_v_all(-1), gkdi_v_add(sign, m[2]));
-    b = gkdi_v_mul(gkdi_v_mul(m[0], m[1]), a);
     radius = gkdi_v_sqrt(gkdi_v_mul(v, gkdi_v_sub(gkdi_v_all(2), v)));
-    gkdi_circle(gkdi_v_load(d->turn + i), &s, &c);
-    s = gkdi_v_mul(s, radius);
-    c = gkdi_v_mul(c, radius);
+    c = gkdi_v_all(0.5f); /* gkd_circle */
+    s = gkdi_v_sub(c, turn);
+    b = gkdi_v_max(gkdi_v_min(s, gkdi_v_sub(c, s)), gkdi_v_sub(gkdi_v_sub(zero, c), s));
+    c = gkdi_v_mul(gkdi_sine(gkdi_v_sub(gkdi_v_abs(s), gkdi_v_all(0.25f))), radius);
+    s = gkdi_v_mul(gkdi_sine(b), radius);
+    b = gkdi_v_mul(gkdi_v_mul(m[0], m[1]), a);
     v = gkdi_v_sub(one, v);
     w[0] = gkdi_v_madd(gkdi_v_mul(gkdi_v_mul(m[0], m[0]), a), sign, one);
     w[0] = gkdi_v_madd(v, m[0], gkdi_v_madd(c, w[0], gkdi_v_mul(s, b)));
@@ -5201,29 +5245,41 @@ GKDI_WIDE static void gkdi_draw_directions(gkdi_draws *d, uint32_t i)
         w[j] = gkdi_v_nmadd(a, n[j], w[j]);
     b = gkdi_v_nmadd(gkdi_v_all(0.5f), gkdi_v_dot(w[0], w[1], w[2], w[0], w[1], w[2]), gkdi_v_all(1.5f));
     for (j = 0; j < 3; ++j)
-        gkdi_v_store(d->out[j] + i, gkdi_v_mul(w[j], b));
+        m[j] = gkdi_v_mul(w[j], b);
 }
 
-/* gkd_choose_lobe, into column i. */
-GKDI_OP void gkdi_choose_lobe(const gkd_handle *handle, const float *u, gkdi_draws *d, uint32_t i)
+/* gkd_choose_lobe. */
+GKDI_OP void gkdi_choose_lobe(const gkd_handle *handle, const float *u, gkd_draw *out)
 {
     float e = handle->uniform, extra = gkd_extend_random(u), r = (u[0] - e) / (1 - e);
-    uint32_t k, n = 0, blocks = (handle->count + 15) / 16;
+    uint32_t k, n = 0, blocks = (handle->count + 7) / 8;
+    out->turn = u[1];
+    if (u[0] < e) {
+        gkd_draw_uniform(u[0], extra, e, out);
+        return;
+    }
+    for (k = 0; k < blocks; ++k)
+        n += gkdi_v_count_at_most(gkdi_v_load(handle->block[k].upper), r);
+    gkd_draw_lobe(handle, n, r, extra / (1 - e), out);
+}
+
+GKDI_WIDE static float gkdi_sample_wide(const gkd_handle *handle, const float *u, float *direction)
+{
     gkd_draw draw;
-    if (u[0] < e)
-        gkd_draw_uniform(u[0], extra, e, &draw);
-    else {
-        for (k = 0; k < blocks; ++k)
-            n += gkdi_v_count_at_most(gkdi_v_load(handle->block[k].upper), r);
-        gkd_draw_lobe(handle, n, r, extra / (1 - e), &draw);
-    }
+    gkdi_f m[3], n[3];
+    float lanes[8];
+    uint32_t k;
+    gkdi_choose_lobe(handle, u, &draw);
     for (k = 0; k < 3; ++k) {
-        d->mean[k][i] = draw.mean[k];
-        d->normal[k][i] = draw.normal[k];
+        m[k] = gkdi_v_all(draw.mean[k]);
+        n[k] = gkdi_v_all(draw.normal[k]);
     }
-    d->kappa[i] = draw.kappa;
-    d->r[i] = draw.r;
-    d->turn[i] = u[1];
+    gkdi_draw_directions(m, n, gkdi_v_all(draw.kappa), gkdi_v_all(draw.r), gkdi_v_all(draw.turn));
+    for (k = 0; k < 3; ++k) {
+        gkdi_v_store(lanes, m[k]);
+        direction[k] = lanes[0];
+    }
+    return gkdi_pdf_inline(handle, direction);
 }
 
 GKDI_WIDE static void gkdi_sample_batch_wide(uint32_t count, const uint32_t *index, const gkd_handle *handles,
@@ -5239,15 +5295,32 @@ GKDI_WIDE static void gkdi_sample_batch_wide(uint32_t count, const uint32_t *ind
         n = count - start < GKDI_DRAWS ? count - start : GKDI_DRAWS;
         for (i = 0; i < n; ++i) {
             uint32_t at = gkdi_at(index, start + i);
-            gkdi_choose_lobe(&handles[at], gkdi_row(u, u_stride, at), &draws, i);
+            gkd_draw draw;
+            gkdi_choose_lobe(&handles[at], gkdi_row(u, u_stride, at), &draw);
+            for (k = 0; k < 3; ++k) {
+                draws.mean[k][i] = draw.mean[k];
+                draws.normal[k][i] = draw.normal[k];
+            }
+            draws.kappa[i] = draw.kappa;
+            draws.r[i] = draw.r;
+            draws.turn[i] = draw.turn;
         }
-        for (i = 0; i < n; i += 16)
-            gkdi_draw_directions(&draws, i);
+        for (i = 0; i < n; i += 8) {
+            gkdi_f m[3], normal[3];
+            for (k = 0; k < 3; ++k) {
+                m[k] = gkdi_v_load(draws.mean[k] + i);
+                normal[k] = gkdi_v_load(draws.normal[k] + i);
+            }
+            gkdi_draw_directions(m, normal, gkdi_v_load(draws.kappa + i), gkdi_v_load(draws.r + i),
+                                 gkdi_v_load(draws.turn + i));
+            for (k = 0; k < 3; ++k)
+                gkdi_v_store(draws.mean[k] + i, m[k]);
+        }
         for (i = 0; i < n; ++i) {
             uint32_t at = gkdi_at(index, start + i);
             float *out = gkdi_row_out(directions, stride, at), d[3];
             for (k = 0; k < 3; ++k)
-                out[k] = d[k] = draws.out[k][i];
+                out[k] = d[k] = draws.mean[k][i];
             pdf[at] = gkdi_pdf_inline(&handles[at], d);
         }
     }
@@ -5261,6 +5334,8 @@ static void gkdi_orient_group(uint32_t simd, uint32_t count, const gkdi_view_fro
 #if GKDI_X86 || GKDI_NEON
     if (simd > GKD_SIMD_SCALAR) {
         gkdi_orient_wide(count, from, product);
+        for (i = 0; i < count; ++i)
+            from[i].handle->simd = simd;
         return;
     }
 #endif
@@ -5283,7 +5358,9 @@ GKD_API void gkd_pdf_batch(const gkd_view *view, uint32_t count, const uint32_t 
     (void)view;
     for (i = 0; i < count; ++i) {
         uint32_t at = gkdi_at(index, i);
-        pdf[at] = gkd_pdf(&handles[at], gkdi_row(directions, stride, at));
+        const float *w = gkdi_row(directions, stride, at);
+        const float direction[3] = {w[0], w[1], w[2]}; /* w may be seen to point to the first member of a struct */
+        pdf[at] = gkd_pdf_scalar(&handles[at], direction);
     }
 }
 
@@ -5293,18 +5370,21 @@ GKD_API void gkd_pdf_directions(const gkd_view *view, const gkd_handle *handle, 
     uint32_t i = 0;
 #if GKDI_X86 || GKDI_NEON
     if (view->simd > GKD_SIMD_SCALAR) {
-        i = count & ~15u;
 #if GKDI_X86
-        if (view->simd == GKD_SIMD_AVX512)
+        if (view->simd == GKD_SIMD_AVX512) {
+            i = count & ~15u;
             gkdi_pdf_same_512(handle, i, directions, stride, pdf);
-        else
+        } else
 #endif
+        {
+            i = count & ~7u;
             gkdi_pdf_same_wide(handle, i, directions, stride, pdf);
+        }
     }
 #endif
     (void)view;
     for (; i < count; ++i)
-        pdf[i] = gkd_pdf(handle, gkdi_row(directions, stride, i));
+        pdf[i] = gkd_pdf_scalar(handle, gkdi_row(directions, stride, i));
 }
 
 GKD_API void gkd_sample_batch(const gkd_view *view, uint32_t count, const uint32_t *index, const gkd_handle *handles,
@@ -5320,7 +5400,7 @@ GKD_API void gkd_sample_batch(const gkd_view *view, uint32_t count, const uint32
     (void)view;
     for (i = 0; i < count; ++i) {
         uint32_t at = gkdi_at(index, i);
-        pdf[at] = gkd_sample(&handles[at], gkdi_row(u, u_stride, at), gkdi_row_out(directions, stride, at));
+        pdf[at] = gkd_sample_scalar(&handles[at], gkdi_row(u, u_stride, at), gkdi_row_out(directions, stride, at));
     }
 }
 
@@ -5329,19 +5409,27 @@ GKD_API void gkd_find_batch(const gkd_view *view, uint32_t count, const uint32_t
                             size_t u_stride, gkd_handle *handles, float *alpha)
 {
     gkdi_view_from from[GKDI_GROUP];
-    uint32_t done, k;
+    const float *at[GKDI_GROUP];
+    float jittered[GKDI_GROUP][3];
+    uint32_t cells[GKDI_GROUP], done, k;
     for (done = 0; done < count; done += GKDI_GROUP) {
         uint32_t n = count - done < GKDI_GROUP ? count - done : GKDI_GROUP;
         for (k = 0; k < n; ++k) {
-            uint32_t i = gkdi_at(index, done + k), c;
+            uint32_t i = gkdi_at(index, done + k);
+            at[k] = gkdi_row(positions, position_stride, i);
+            if (u) {
+                gkd_jitter(view, at[k], gkdi_row(u, u_stride, i), jittered[k]);
+                at[k] = jittered[k];
+            }
+        }
+        if (n > 1)
+            gkdi_find_cells(view->nodes, n, at, cells);
+        else
+            cells[0] = gkd_find_cell(view, at[0]); /* shorter: nothing to overlap */
+        for (k = 0; k < n; ++k) {
+            uint32_t i = gkdi_at(index, done + k);
             const float *position = gkdi_row(positions, position_stride, i);
-            const gkd_cell *cell;
-            c = gkd_find_cell_near(view, position, u ? gkdi_row(u, u_stride, i) : NULL);
-            cell = &view->cells[c];
-            handles[i].cell = c;
-            handles[i].alpha = cell->alpha;
-            handles[i].reflected = cell->reflected;
-            handles[i].uniform = view->uniform;
+            const gkd_cell *cell = gkd_set_cell(view, cells[k], &handles[i]);
             if (alpha)
                 alpha[i] = cell->alpha;
             from[k].handle = &handles[i];
@@ -5353,6 +5441,30 @@ GKD_API void gkd_find_batch(const gkd_view *view, uint32_t count, const uint32_t
         }
         gkdi_orient_group(view->simd, n, from, !view->no_product);
     }
+}
+
+GKD_API void gkd_find_one(const gkd_view *view, const float position[3], const float *normal, const float *u,
+                          gkd_handle *handle)
+{
+    gkd_find_batch(view, 1, NULL, position, 0, normal, 0, u, 0, handle, NULL);
+}
+
+GKD_API float gkd_sample_one(const gkd_handle *handle, const float u[2], float direction[3])
+{
+#if GKDI_X86 || GKDI_NEON
+    if (handle->simd > GKD_SIMD_SCALAR)
+        return gkdi_sample_wide(handle, u, direction);
+#endif
+    return gkd_sample_scalar(handle, u, direction);
+}
+
+GKD_API float gkd_pdf_one(const gkd_handle *handle, const float direction[3])
+{
+#if GKDI_X86 || GKDI_NEON
+    if (handle->simd > GKD_SIMD_SCALAR)
+        return gkdi_pdf_wide(handle, direction);
+#endif
+    return gkd_pdf_scalar(handle, direction);
 }
 
 /* ---- >>files ------------------------------------------------------------------------------------------------ */
@@ -5668,7 +5780,7 @@ static gkd_result gkdi_block_valid(gkdi_block *b, uint64_t size, const gkd_desc 
     if (b->cells < 1 || b->cells > GKDI_MAX_CELLS || b->nodes != 2 * b->cells - 1)
         return GKD_CORRUPT;
     gkdi_block_layout(&shape);
-    if (shape.size != size || memcmp(&shape, b, sizeof shape) != 0 || !gkdi_within((double)b->uniform, 1e-4, 1))
+    if (shape.size != size || memcmp(&shape, b, sizeof shape) != 0 || !gkdi_within_float(b->uniform, 1e-4f, 1))
         return GKD_CORRUPT;
     seen = (unsigned char *)gkdi_allocate(desc, b->cells, 1);
     if (!seen)
@@ -5778,7 +5890,8 @@ GKD_API gkd_result gkd_load(const gkd_desc *desc, const void *data, size_t size,
     result = gkd_resolve(&d, &d);
     if (result)
         return result == GKD_BAD_ALLOCATOR ? result : GKD_BAD_FILE;
-    if (h.cells < 1 || h.cells > GKDI_MAX_CELLS || h.nodes != 2 * h.cells - 1 || h.pending > d.update_samples ||
+    if (!gkdi_within((double)h.stats.closed_share, 0, 1) || !gkdi_within((double)h.stats.mean_alpha, 0, 1) ||
+        h.cells < 1 || h.cells > GKDI_MAX_CELLS || h.nodes != 2 * h.cells - 1 || h.pending > d.update_samples ||
         !(h.all_samples >= 0 && h.all_samples < INFINITY && h.held_samples >= 0 && h.held_samples <= h.all_samples))
         return GKD_BAD_FILE;
     f = (gkd_field *)gkdi_allocate(&d, 1, sizeof *f);

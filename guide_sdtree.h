@@ -96,10 +96,11 @@
      of g / p; W^2 = mean of (pixel_contribution / g)^2, weighted as in V(1), turns squared contributions into squared
      pixels. Guiding pays where V(1) > (1 + gate_margin) V(a) + gate_gain / W^2: it must save a share of the second
      moment, and enough of the pixel's noise to be worth its time. Samples of a pass judge the tree built from earlier
-     passes. Since no guide has V(a) < m^2, a cell with V(1) < m^2 + gate_gain / W^2 closes without waiting for a good
-     tree. Verdicts need 95 % confidence and many non-zero samples: cells whose light is rarely found stay open. Closed
-     cells are tried again every gate_probe passes and need more to open than to close. Cells without verdict guide.
-     Without a pixel estimate (gsd_pass.pixel_estimate) 1 / W^2 = 16 m^2.
+     passes. Since no guide has V(a) < m^2, a cell with V(1) < m^2 + gate_gain / W^2 closes whatever its tree, though
+     not before eight rebuilds: light that is rare must have had the time to be found. Verdicts need 95 % confidence and
+   many non-zero samples: cells whose light is rarely found stay open. Closed cells are tried again every gate_probe
+   passes and need more to open than to close. Cells without verdict guide. Without a pixel estimate
+   (gsd_pass.pixel_estimate) 1 / W^2 = 16 m^2.
 
    THE SAMPLE
      One per non-delta path vertex whose direction was traced. radiance L: from that direction, no cosine, no BSDF, not
@@ -992,9 +993,12 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_MAX_ROOT 1e15     /* values are clamped to this before squaring */
 #define GSDI_CONFIDENCE 1.645  /* one-sided 95 % of the normal distribution */
 #define GSDI_MIN_EFFECTIVE                                                                                             \
-    128.0                         /* effective non-zero samples for the verdict "this tree does not pay"; fewer closes \
-                                     cells whose light is rarely found */
-#define GSDI_MIN_EVEN 32.0        /* for "too even to pay" */
+    128.0                  /* effective non-zero samples for the verdict "this tree does not pay"; fewer closes        \
+                              cells whose light is rarely found */
+#define GSDI_MIN_EVEN 32.0 /* for "too even to pay" */
+#define GSDI_MIN_EVEN_REBUILDS                                                                                         \
+    8 /* and before that verdict: the first cells are large, and have not yet found light that is rare; without it all \
+         of pool closes at once */
 #define GSDI_MIN_OPEN 4.0         /* for "pays" */
 #define GSDI_ENOUGH_HITS 256u     /* non-zero samples of a cell and pass; from then on the gate takes one of eight */
 #define GSDI_REFLECTED_SAMPLES 32 /* of a cell and pass, for its mean reflected radiance to count */
@@ -2977,7 +2981,7 @@ static void gsdi_verdict(const gsd_desc *desc, bool pixels, gsdi_state *s, gsd_s
         s->gate = GSD_GATE_OPEN;
     } else if (closed) { /* not as even as it seemed */
         s->gate = mean > 0 && even - even_error > 1.5 * limit ? GSD_GATE_UNJUDGED : GSD_GATE_CLOSED;
-    } else if ((even + even_error < limit && n >= GSDI_MIN_EVEN) ||
+    } else if ((even + even_error < limit && n >= GSDI_MIN_EVEN && s->rebuilds >= GSDI_MIN_EVEN_REBUILDS) ||
                (mean + error < 0 && n >= GSDI_MIN_EFFECTIVE && s->rebuilds >= GSDI_MIN_REBUILDS)) {
         stats->closed++;
         s->gate = GSD_GATE_CLOSED;

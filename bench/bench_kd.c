@@ -236,18 +236,30 @@ static void query_all(const gkd_view *view, queries *q, bool normals)
     bench_use(q->pdf);
 }
 
-static double time_inline(const gkd_view *view, queries *q, bool normals)
+static void query_singly(const gkd_view *view, queries *q, bool normals)
 {
-    double best;
-    BENCH_MIN_NS(best, 3, DIRECTIONS, {
-        for (int i = 0; i < DIRECTIONS; ++i) {
-            gkd_handle h;
-            gkd_find(view, q->position[i], normals ? q->normal[i] : NULL, NULL, &h);
-            q->pdf[i] = gkd_sample(&h, q->u[i], q->sampled[i]) + gkd_pdf(&h, q->given[i]);
-        }
-        bench_use(q->pdf);
-    });
-    return best;
+    for (int i = 0; i < DIRECTIONS; ++i) {
+        gkd_handle h;
+        gkd_find(view, q->position[i], normals ? q->normal[i] : NULL, NULL, &h);
+        q->pdf[i] = gkd_sample(&h, q->u[i], q->sampled[i]) + gkd_pdf(&h, q->given[i]);
+    }
+    bench_use(q->pdf);
+}
+
+static void bench_queries(const gkd_view *view, queries *q)
+{
+    double limit = QUERY_LINES * bench_load_throughput((size_t)1 << 18), naive;
+    gkd_view scalar = *view;
+    scalar.simd = GKD_SIMD_SCALAR;
+    row_titles("ns per query: find, sample, another pdf");
+    for (int normals = 0; normals < 2; ++normals) {
+        bench_time batched, single;
+        BENCH_MIN_NS(naive, 3, DIRECTIONS, query_singly(&scalar, q, normals););
+        BENCH_TIME(batched, repeats, DIRECTIONS, query_all(view, q, normals););
+        BENCH_TIME(single, repeats, DIRECTIONS, query_singly(view, q, normals););
+        row(normals ? "query, batched, with the cosine" : "query, batched", batched, limit, naive, 100);
+        row(normals ? "query, single, with the cosine" : "query, single", single, limit, naive, 200);
+    }
 }
 
 static void bench_field(bool quick)
@@ -274,13 +286,7 @@ static void bench_field(bool quick)
     }
     printf("\nSF1: %u cells, %.1f lobes each, %.0f bytes a cell in both parts, %llu lookahead cells\n", stats.cells,
            (double)stats.lobes / stats.cells, (double)stats.bytes / stats.cells, (unsigned long long)stats.lookahead);
-    row_titles("ns per query: find, sample, another pdf");
-    for (int normals = 0; normals < 2; ++normals) {
-        bench_time t;
-        BENCH_TIME(t, repeats, DIRECTIONS, query_all(&view, q, normals););
-        row(normals ? "query, batched, with the cosine" : "query, batched", t, QUERY_LINES * load,
-            time_inline(&view, q, normals), 100);
-    }
+    bench_queries(&view, q);
     row_titles("ns per sample");
     int times = quick ? 1 : 5, log2n = quick ? 16 : 20;
     desc.split = GKD_SPLIT_SIGNATURE;

@@ -2,7 +2,8 @@
 # Run test programs (cmocka, TAP), the compile matrix and the command-line tests; say how long each test took; end with
 #   N passed, N failed
 # Exit status 1 where a test failed, a program crashed, or fewer tests ran than tests/expected-count says.
-# Environment: BUILD folder, CONFIG, CC, TESTS = names to run (empty = all; "matrix", "rig" and "cli" are names too),
+# Environment: BUILD folder, CONFIG, CC, TESTS = names to run (empty = all; "matrix", "uninitialised", "rig" and "cli"
+# are names too),
 # RECORD=1 rewrites tests/expected-count.
 export LC_ALL=C
 cd "$(dirname "$0")/.." || exit 1
@@ -84,6 +85,7 @@ wanted() { [ -z "${TESTS-}" ] || case " $TESTS " in *" $1 "*) true ;; *) false ;
 for program in "$@"; do run "$(basename "$program")" "$program"; done
 # The matrix compiles the headers by itself: once is enough, not once per configuration.
 if [ "$CONFIG" = release ] && wanted matrix; then run matrix bash tests/compile-matrix.sh; fi
+if [ "$CONFIG" = release ] && wanted uninitialised; then run uninitialised bash tests/uninitialised.sh; fi
 if [ "$CONFIG" = release ] && wanted rig; then run rig bash tests/rig.sh; fi # times: only the fast build's say anything
 if [ -x "$BUILD/render" ] && wanted cli; then run cli bash tests/run-cli.sh; fi
 
@@ -96,7 +98,7 @@ elif [ -z "${TESTS-}" ] && [ -e tests/expected-count ]; then
     # Whatever is listed must have run.
     while read -r name count; do
         case $name in '#' | '') continue ;; esac
-        case $name in matrix | rig) [ "$CONFIG" != release ] && continue ;; esac
+        case $name in matrix | rig | uninitialised) [ "$CONFIG" != release ] && continue ;; esac
         case $'\n'"$recorded" in *$'\n'"$name "*) ;; *)
             failed=$((failed + 1)) failures="$failures  $name: did not run ($count tests expected)"$'\n' ;;
         esac

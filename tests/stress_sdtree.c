@@ -11,7 +11,6 @@
 
 #include "building.h"
 
-#define PI 3.14159265358979323846
 #define MOST 20000 /* samples of a batch */
 
 /* ---- checks of a field */
@@ -87,38 +86,6 @@ static double alias_apart(const gsd_view *v, const gsd_handle *h)
     }
     free(share);
     return apart;
-}
-
-static float hostile_number(stress *s)
-{
-    const float some[] = {NAN,     INFINITY, -INFINITY, 0,       -0.0f, 1,        -1,    1e-40f,
-                          FLT_MIN, -1e30f,   1e30f,     FLT_MAX, 0.5f,  -FLT_MAX, 1e18f, 1e-20f};
-    return some[stress_below(s, sizeof some / sizeof *some)];
-}
-
-static void unit_direction(stress *s, float d[3])
-{
-    double z = 2 * stress_unit(s) - 1, phi = 2 * PI * stress_unit(s), r = sqrt(1 - z * z);
-    d[0] = (float)(r * cos(phi));
-    d[1] = (float)(r * sin(phi));
-    d[2] = (float)z;
-}
-
-static void any_normal(stress *s, float n[3])
-{
-    unit_direction(s, n);
-    if (stress_chance(s, 0.3))
-        n[stress_below(s, 3)] = hostile_number(s);
-    if (stress_chance(s, 0.1))
-        memset(n, 0, 3 * sizeof *n);
-}
-
-/* Two numbers in [0, 1), often at the ends; a careless 1 too, which is clamped. */
-static void any_random(stress *s, float u[2])
-{
-    const float ends[] = {0, 0x1p-149f, 0x1p-24f, 0.25f, 0.5f, 0x1.fffffep-2f, 0x1.fffffep-1f, 1};
-    for (int k = 0; k < 2; ++k)
-        u[k] = stress_chance(s, 0.3) ? ends[stress_below(s, 8)] : stress_unitf(s);
 }
 
 static bool close_to(float a, float b) { return fabsf(a - b) <= 2e-6f * b; }
@@ -307,98 +274,6 @@ static gsd_desc any_desc(stress *s)
     return d;
 }
 
-/* How the samples of a batch are made. */
-typedef struct recipe {
-    int where;     /* 0 anywhere, 1 one point, 2 a line, 3 cell borders, 4 outside, 5 anything */
-    int direction; /* 0 anywhere, 1 one, 2 seam and poles, 3 not unit, 4 anything */
-    int value;     /* 0 one, 1 any power of ten, 2 a lamp, 3 zeros, 4 anything */
-    int pdf;       /* 0 uniform, 1 any power of ten, 2 anything */
-    float point[3], lamp[3];
-} recipe;
-
-static recipe any_recipe(stress *s, bool hostile)
-{
-    recipe r = {(int)stress_below(s, hostile ? 6 : 4),
-                (int)stress_below(s, hostile ? 5 : 3),
-                (int)stress_below(s, hostile ? 5 : 4),
-                hostile ? (int)stress_below(s, 3) : 0,
-                {0, 0, 0},
-                {0, 0, 0}};
-    for (int k = 0; k < 3; ++k)
-        r.point[k] = stress_unitf(s);
-    unit_direction(s, r.lamp);
-    return r;
-}
-
-static void any_position(stress *s, const recipe *r, const gsd_desc *d, float p[3])
-{
-    float t = stress_unitf(s);
-    for (int k = 0; k < 3; ++k) {
-        float size = d->bounds_max[k] - d->bounds_min[k], x = stress_unitf(s);
-        switch (r->where) {
-        case 1:
-            x = r->point[k];
-            break;
-        case 2:
-            x = r->point[k] * t;
-            break;
-        case 3: /* of the cube, which is 0.1 % larger */
-            x = (float)stress_below(s, 65) / 64 * 1.001f - 0.0005f;
-            break;
-        case 4:
-            x = (2 * x - 1) * (float)stress_log(s, 1, 1e12);
-            break;
-        }
-        p[k] = d->bounds_min[k] + size * x;
-        if (r->where == 5 && stress_chance(s, 0.2))
-            p[k] = hostile_number(s) * 0.125f; /* three of them stay finite when summed */
-    }
-}
-
-static void any_direction(stress *s, const recipe *r, float d[3])
-{
-    const float axes[][3] = {{1, 0, 0}, {1, -0.0f, 0}, {-1, 0, 0}, {0, 0, 1}, {0, 0, -1}, {0, 1, 0}, {1, -1e-30f, 0}};
-    unit_direction(s, d);
-    if (r->direction == 1)
-        memcpy(d, r->lamp, sizeof r->lamp);
-    if (r->direction == 2)
-        memcpy(d, axes[stress_below(s, 7)], 3 * sizeof *d);
-    if (r->direction == 3) {
-        float l = (float)stress_log(s, 1e-5, 1e5);
-        for (int k = 0; k < 3; ++k)
-            d[k] *= l;
-    }
-    if (r->direction == 4 && stress_chance(s, 0.2))
-        d[stress_below(s, 3)] = hostile_number(s);
-    if (r->direction == 4 && stress_chance(s, 0.1))
-        memset(d, 0, 3 * sizeof *d);
-}
-
-static float any_value(stress *s, const recipe *r, const float d[3])
-{
-    switch (r->value) {
-    case 0:
-        return 1;
-    case 1:
-        return (float)stress_log(s, 1e-30, 9e29);
-    case 2:
-        return d[0] * r->lamp[0] + d[1] * r->lamp[1] + d[2] * r->lamp[2] > 0.95f ? 1000 : stress_unitf(s);
-    case 3:
-        return stress_chance(s, 0.5) ? 0 : GSD_REJECTED;
-    default:
-        return stress_chance(s, 0.2) ? hostile_number(s) : stress_unitf(s);
-    }
-}
-
-static float any_pdf(stress *s, const recipe *r)
-{
-    if (r->pdf == 1)
-        return (float)stress_log(s, 1e-30, 1e30);
-    return r->pdf == 2 && stress_chance(s, 0.1) ? hostile_number(s) : GSD_INV_4PI;
-}
-
-static bool bad_value(float x) { return !(x >= 0) || !isfinite(x) || !((double)x < 9.9e29); }
-
 /* Whether a sample is bad, by the words of the header's ERRORS; its direction shows as pdf_mix = 0. */
 static bool bad_sample(const gsd_training_sample *t, bool forest)
 {
@@ -416,7 +291,7 @@ static uint32_t make_samples(stress *s, const recipe *r, const gsd_desc *d, gsd_
     uint32_t bad = 0;
     for (uint32_t i = 0; i < n; ++i) {
         float p[3], dir[3], normal[3], value, contribution, pixel;
-        any_position(s, r, d, p);
+        any_position(s, r, d->bounds_min, d->bounds_max, p);
         any_direction(s, r, dir);
         any_normal(s, normal);
         value = any_value(s, r, dir);
@@ -431,8 +306,6 @@ static uint32_t make_samples(stress *s, const recipe *r, const gsd_desc *d, gsd_
 
 static gsd_training_sample batch[MOST];
 static uint32_t batch_cells[MOST];
-
-static uint32_t some(stress *s, double most) { return (uint32_t)stress_log(s, 1, most); }
 
 static gsd_result record(stress *s, gsd_stream *stream, const gsd_field *f, uint32_t n)
 {
@@ -594,17 +467,9 @@ static void all_zeros(stress *s)
 
 /* ---- groups: descriptors, memory */
 
-/* Limits as gsd_desc documents them. */
-typedef struct limit {
-    size_t at;
-    bool whole;
-    double low, high;
-} limit;
-#define LIMIT(name, whole, low, high)                                                                                  \
-    {                                                                                                                  \
-        offsetof(gsd_desc, name), whole, low, high                                                                     \
-    }
-static const limit limits[] = {
+/* As gsd_desc documents them. */
+#define LIMIT(name, whole, low, high) STRESS_LIMIT(gsd_desc, name, whole, low, high)
+static const stress_limit limits[] = {
     LIMIT(switch_after, false, 0.001, 1e6),
     LIMIT(split_samples, false, 16, 1e9),
     LIMIT(rho, false, 1e-5, 1),
@@ -621,53 +486,20 @@ static const limit limits[] = {
     LIMIT(gate_probe, true, 1, 1000),
 };
 
-/* Put one option at or beyond a limit; true where it must be refused. */
-static bool set_extreme(stress *s, gsd_desc *d)
-{
-    const limit *l = &limits[stress_below(s, sizeof limits / sizeof *limits)];
-    const double beyond[] = {l->low * 0.9, l->high * 1.1 + 1, -1, NAN, INFINITY, -l->high, 1e-40};
-    uint32_t kind = stress_below(s, 14);
-    double x = kind < 7 ? beyond[kind] : kind < 10 ? l->low : kind < 13 ? l->high : 0;
-    if (l->whole) {
-        uint32_t n = kind < 7 ? (uint32_t)l->high + 1 + stress_below(s, 0x7fffffff) : (uint32_t)x;
-        memcpy((char *)d + l->at, &n, sizeof n);
-    } else {
-        float v = (float)x;
-        memcpy((char *)d + l->at, &v, sizeof v);
-    }
-    return kind < 7;
-}
-
-/* Bounds of all sizes and places; true where they must be refused. */
-static bool set_bounds(stress *s, gsd_desc *d)
-{
-    double extent = 0;
-    bool bad = false;
-    for (int k = 0; k < 3; ++k) {
-        float size = stress_chance(s, 0.2) ? 0 : (float)stress_log(s, 1e-29, 1e29);
-        float low = stress_chance(s, 0.5) ? 0 : (float)stress_log(s, 1e-20, 1e20) * (stress_chance(s, 0.5) ? -1 : 1);
-        low = stress_chance(s, 0.2) ? -0.0f : low;
-        d->bounds_min[k] = stress_chance(s, 0.03) ? hostile_number(s) : low;
-        d->bounds_max[k] = stress_chance(s, 0.03) ? hostile_number(s) : low + size;
-        bad |= !isfinite(d->bounds_min[k]) || !isfinite(d->bounds_max[k]) || d->bounds_max[k] < d->bounds_min[k];
-        extent = fmax(extent, (double)d->bounds_max[k] - (double)d->bounds_min[k]);
-        bad |= !(extent < 1e30) || !(fabsf(d->bounds_min[k]) < 1e30f);
-    }
-    return bad || !(extent > 1e-30);
-}
-
 /* Options at and beyond their limits: refused or a field that learns. */
 static void descriptors(stress *s)
 {
     gsd_desc d = any_desc(s);
+    double extent;
     bool bad = false;
     gsd_field *f = NULL;
     gsd_stream *stream = NULL;
     gsd_result result;
     if (stress_chance(s, 0.7))
-        bad = set_extreme(s, &d);
+        bad = set_extreme(s, &d, limits, sizeof limits / sizeof *limits);
     if (stress_chance(s, 0.6))
-        bad = (set_bounds(s, &d) && !d.forest_cells) || bad;
+        bad =
+            (!set_bounds(s, d.bounds_min, d.bounds_max, &extent) || !(extent > 1e-30)) && !d.forest_cells ? true : bad;
     d.alpha_mode = stress_chance(s, 0.02) ? (gsd_alpha_mode)77 : d.alpha_mode;
     d.max_bytes = stress_chance(s, 0.05) ? (1u << 20) - 1 : d.max_bytes;
     bad = bad || d.alpha_mode > GSD_ALPHA_GRID || d.max_bytes < 1u << 20;
@@ -1011,32 +843,6 @@ static void failing_allocator(stress *s)
 }
 
 /* ---- groups: saves */
-
-static const char *forge(stress *s, unsigned char *data, size_t *size, const unsigned char *other, size_t other_size)
-{
-    size_t at = stress_chance(s, 0.5) ? stress_below(s, 700) % *size : stress_below(s, (uint32_t)*size), n;
-    uint32_t word = stress_chance(s, 0.2) ? 0xffffffffu : (uint32_t)stress_next(s) >> stress_below(s, 32);
-    switch (stress_below(s, 5)) {
-    case 0:
-        data[at] ^= (unsigned char)(1u << stress_below(s, 8));
-        return "bit";
-    case 1:
-        *size = at;
-        return "cut";
-    case 2: /* a piece of another save, at the same place or elsewhere */
-        n = some(s, (double)other_size);
-        n = n < *size - at ? n : *size - at;
-        memcpy(data + at, other + (at + n <= other_size ? at : 0), n < other_size ? n : other_size);
-        return "splice";
-    case 3: /* lengths and counts stand in the headers */
-        at = stress_below(s, 700) / 4 * 4;
-        break;
-    }
-    at = at / 4 * 4;
-    if (at + 4 <= *size)
-        memcpy(data + at, &word, 4);
-    return "word";
-}
 
 /* Make size and checksum right again, so that what follows them is looked at. */
 static void seal(unsigned char *data, size_t size)

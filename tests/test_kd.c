@@ -337,6 +337,46 @@ static void test_bad_descriptors_are_refused_by_name(void **state)
     assert_non_null(strstr(gkd_result_string(GKD_BAD_BOUNDS), "bounds_min"));
 }
 
+static void test_documented_limits_are_accepted(void **state)
+{
+    (void)state;
+    gkd_desc d, r;
+    gkd_field *f, *g;
+    size_t size;
+#define ACCEPTED(name, low, high)                                                                                      \
+    do {                                                                                                               \
+        for (int i = 0; i < 2; ++i) {                                                                                  \
+            d = unit_cube();                                                                                           \
+            d.name = i ? high : low;                                                                                   \
+            OK(gkd_resolve(&d, &r));                                                                                   \
+            assert_true(r.name == d.name);                                                                             \
+        }                                                                                                              \
+    } while (0)
+    ACCEPTED(split_samples, 64, 1000000000);
+    ACCEPTED(lookahead, 1, 7);
+    ACCEPTED(min_samples, 16, 1000000000);
+    ACCEPTED(radiance_step, 0.001f, 100);
+    ACCEPTED(direction_step, 0.001f, 3.1f);
+    ACCEPTED(confidence, 1e-12f, 0.4f);
+    ACCEPTED(max_levels, 1, 60);
+    ACCEPTED(max_lobes, 1, 32);
+    ACCEPTED(update_samples, 1024, 1 << 26);
+    ACCEPTED(alpha, 0.05f, 1);
+    ACCEPTED(uniform, 1e-4f, 1);
+    ACCEPTED(gate_margin, 0.001f, 10);
+    ACCEPTED(gate_gain, 0.0001f, 1000);
+    ACCEPTED(gate_probe, 1, 1000);
+#undef ACCEPTED
+    d = unit_cube();
+    d.uniform = 1e-4f; /* and in a save */
+    OK(gkd_create(&d, &f));
+    void *data = save(f, &size);
+    OK(gkd_load(NULL, data, size, &g));
+    free(data);
+    gkd_destroy(f);
+    gkd_destroy(g);
+}
+
 static void test_sizes_are_as_documented(void **state)
 {
     (void)state;
@@ -345,7 +385,7 @@ static void test_sizes_are_as_documented(void **state)
     assert_int_equal(sizeof(gkd_lobe), 24);
     assert_int_equal(sizeof(gkd_cell), 32);
     assert_int_equal(sizeof(gkd_node), 8);
-    assert_int_equal(sizeof(gkd_lobe_block), 448);
+    assert_int_equal(sizeof(gkd_lobe_block), 224);
     assert_int_equal(offsetof(gkd_handle, block), 64);
     assert_int_equal(sizeof(gkd_stats) % 8, 0);
 }
@@ -462,12 +502,13 @@ static void test_density_of_a_trained_field_integrates_to_one_and_is_sampled(voi
     gkd_destroy(f);
 }
 
-/* Inline and batch functions say the same at each level. */
+/* At each level single queries and batches say the same as single ones of the scalar level. */
 static void test_batches_equal_single_queries_at_every_level(void **state)
 {
     (void)state;
     enum { N = 257 };
     static gkd_handle one[N], many[N];
+    gkd_handle single;
     static float p[N][3], n[N][3], u[N][2], w[N][3], x[N][3], pdf[N], alpha[N], w1[N][3], pdf1[N];
     gkd_simd levels[5];
     uint32_t level_count = levels_here(levels);
@@ -477,8 +518,9 @@ static void test_batches_equal_single_queries_at_every_level(void **state)
     gkd_field *f = train(&d, 4, 8192);
     for (uint32_t l = 0; l < level_count; ++l)
         for (int surface = 0; surface < 2; ++surface) {
-            gkd_view v = gkd_get_view(f);
+            gkd_view v = gkd_get_view(f), scalar = v;
             v.simd = levels[l];
+            scalar.simd = GKD_SIMD_SCALAR;
             for (int i = 0; i < N; ++i) {
                 for (int k = 0; k < 3; ++k)
                     p[i][k] = rndf();
@@ -486,8 +528,7 @@ static void test_batches_equal_single_queries_at_every_level(void **state)
                 random_direction(x[i]);
                 u[i][0] = rndf();
                 u[i][1] = rndf();
-                gkd_find(&v, p[i], surface ? n[i] : NULL, NULL, &one[i]);
-                w1[i][0] = 0;
+                gkd_find(&scalar, p[i], surface ? n[i] : NULL, NULL, &one[i]);
                 pdf1[i] = gkd_sample(&one[i], u[i], w1[i]);
             }
             gkd_find_batch(&v, N, NULL, p[0], sizeof p[0], surface ? n[0] : NULL, sizeof n[0], NULL, 0, many, alpha);
@@ -500,7 +541,13 @@ static void test_batches_equal_single_queries_at_every_level(void **state)
                 assert_true(fabsf(a - b) <= 1e-4f * a);
                 assert_true(fabs(dot(w[i], w1[i]) - 1) < 1e-5);
                 assert_true(fabsf(pdf[i] - gkd_pdf(&one[i], w[i])) <= 3e-5f * pdf[i]);
-                (void)pdf1;
+                gkd_find(&v, p[i], surface ? n[i] : NULL, NULL, &single);
+                assert_int_equal(single.simd, levels[l]);
+                assert_int_equal(single.cell, one[i].cell);
+                pdf1[i] = gkd_sample(&single, u[i], w1[i]);
+                assert_true(fabs(dot(w[i], w1[i]) - 1) < 1e-5);
+                assert_true(fabsf(pdf1[i] - gkd_pdf(&one[i], w1[i])) <= 1e-4f * pdf1[i]);
+                assert_true(fabsf(gkd_pdf(&single, x[i]) - a) <= 1e-4f * a);
             }
             gkd_pdf_batch(&v, N, NULL, one, x[0], sizeof x[0], pdf);
             for (int i = 0; i < N; ++i)
@@ -561,15 +608,15 @@ static void test_the_lamp_is_found_from_everywhere_in_a_cell(void **state)
         uint32_t best = 0;
         float most = 0, upper = 0;
         for (uint32_t k = 0; k < h.count; ++k) {
-            float now = h.block[k / 16].upper[k % 16];
+            float now = h.block[k / 8].upper[k % 8];
             if (now - upper > most) {
                 most = now - upper;
                 best = k;
             }
             upper = now;
         }
-        b = &h.block[best / 16];
-        float mean[3] = {b->x[best % 16], b->y[best % 16], b->z[best % 16]};
+        b = &h.block[best / 8];
+        float mean[3] = {b->x[best % 8], b->y[best % 8], b->z[best % 8]};
         assert_true(dot(mean, to) > cos(0.2));
     }
     free(s);
@@ -1166,6 +1213,39 @@ static void test_forged_saves_never_harm(void **state)
     free(data);
 }
 
+/* Of what a save counts, shares steer callers: gkd_record_fraction. */
+static void test_saves_with_impossible_shares_are_refused(void **state)
+{
+    (void)state;
+    static const float bad[] = {NAN, INFINITY, -1, 1.5f, -INFINITY};
+    size_t size;
+    unsigned char *data = small_save(&size);
+    for (int i = 0; i < 11; ++i) {
+        gkdi_header h;
+        gkd_field *f;
+        memcpy(&h, data, sizeof h);
+        gkd_stats keep = h.stats;
+        if (i < 10)
+            *(i & 1 ? &h.stats.closed_share : &h.stats.mean_alpha) = bad[i / 2];
+        memcpy(data, &h, sizeof h);
+        h.checksum = gkdi_hash_bytes(1, data + GKDI_CHECKED_FROM, size - GKDI_CHECKED_FROM);
+        memcpy(data, &h, sizeof h);
+        assert_int_equal(gkd_load(NULL, data, size, &f), i < 10 ? GKD_BAD_FILE : GKD_OK);
+        gkd_destroy(f);
+        h.stats.levels = 77; /* counted anew */
+        h.stats.closed_share = h.stats.mean_alpha = 0;
+        memcpy(data, &h, sizeof h);
+        h.checksum = gkdi_hash_bytes(1, data + GKDI_CHECKED_FROM, size - GKDI_CHECKED_FROM);
+        memcpy(data, &h, sizeof h);
+        OK(gkd_load(NULL, data, size, &f));
+        assert_int_equal(f->stats.levels, keep.levels);
+        gkd_destroy(f);
+        h.stats = keep;
+        memcpy(data, &h, sizeof h);
+    }
+    free(data);
+}
+
 static void test_merge_equals_training_together(void **state)
 {
     (void)state;
@@ -1465,6 +1545,13 @@ static void test_validate_notices_damage(void **state)
     f->cells[0].look[0].sum = -1;
     assert_int_equal(gkd_validate(f), GKD_CORRUPT);
     f->cells[0].look[0].sum = sum;
+    for (int k = 0; k < 3; ++k) {
+        double mean = f->cells[0].look[0].mean[k];
+        f->cells[0].look[0].mean[k] = NAN;
+        assert_int_equal(gkd_validate(f), GKD_CORRUPT);
+        f->cells[0].look[0].mean[k] = mean;
+        OK(gkd_validate(f));
+    }
     gkdi_block_nodes(f->block)[0].link = GKD_LEAF | 1000000;
     assert_int_equal(gkd_validate(f), GKD_CORRUPT);
     gkd_destroy(f);
@@ -1476,6 +1563,7 @@ int main(void)
         cmocka_unit_test(test_documented_defaults_are_the_defaults),
         cmocka_unit_test(test_the_example_in_the_comment_compiles),
         cmocka_unit_test(test_bad_descriptors_are_refused_by_name),
+        cmocka_unit_test(test_documented_limits_are_accepted),
         cmocka_unit_test(test_sizes_are_as_documented),
         cmocka_unit_test(test_an_untrained_field_is_uniform),
         cmocka_unit_test(test_density_of_a_trained_field_integrates_to_one_and_is_sampled),
@@ -1493,6 +1581,7 @@ int main(void)
         cmocka_unit_test(test_save_and_load_go_on_training_the_same),
         cmocka_unit_test(test_truncated_and_flipped_saves_are_refused),
         cmocka_unit_test(test_forged_saves_never_harm),
+        cmocka_unit_test(test_saves_with_impossible_shares_are_refused),
         cmocka_unit_test(test_merge_equals_training_together),
         cmocka_unit_test(test_every_failed_allocation_is_survived),
         cmocka_unit_test(test_lost_samples_are_counted),
