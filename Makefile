@@ -6,6 +6,8 @@
 #   make bench-readme                     put the last bench's figures into the README
 #   make bench-error [PRESET=quick|full]  error against run time: tables and plots in out/bench-error-PRESET
 #   make bench-error PRESET=denoise       trained and then frozen fields: not denoised, after and during the training
+#   make study-kd [PRESET=quick|full]     signatures of guide_kd.h against sample counts: out/study-kd-PRESET
+#   make study-kd-readme [PRESET=quick]   put its tables and pictures into the README
 #   make stress      hostile and extreme input for every header, STRESS_SECONDS=30 STRESS_SEED=1 STRESS_ONLY=group
 #                    STRESS_CASES=50: so many cases a group instead, the same on every machine
 #   make format      clang-format in place  make lint        only check
@@ -88,14 +90,14 @@ MICRO := $(B)/bench_sdtree $(B)/bench_kd $(B)/bench_field $(B)/bench_denoise
 BENCHES := $(patsubst bench/%.c,$(B)/%,$(wildcard bench/bench_*.c))
 STRESSES := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/stress_*.c))
 # Programs of bench/ that are not timings: `make bench` does not run them.
-BENCH_MAINS := make_reference
+BENCH_MAINS := make_reference study_kd
 BENCH_TOOLS := $(patsubst bench/%.c,$(B)/%,$(wildcard $(BENCH_MAINS:%=bench/%.c)))
 # TESTS="a b" picks test_a and test_b, and "matrix", "uninitialised", "rig", "cli"; empty = all.
 TEST_PROGRAMS := $(if $(TESTS),$(filter $(TESTS:%=$(B)/tests/test_%),$(TESTS_ALL)),$(TESTS_ALL))
 SOURCES := $(sort $(HEADERS) $(wildcard examples/*.c examples/tracer/*.[ch] examples/tracer/*.cpp tests/*.[ch] tests/*/*.[ch] bench/*.[ch] bench/*.cpp))
 SCRIPTS := .ci/run $(wildcard tests/*.sh examples/*.sh bench/*.sh)
 
-.PHONY: all programs deps check-deps demo test stress run-demo run-test run-stress expected-count bench run-bench bench-readme bench-error run-bench-error format lint clean help
+.PHONY: all programs deps check-deps demo test stress run-demo run-test run-stress expected-count bench run-bench bench-readme bench-error run-bench-error study-kd run-study-kd study-kd-readme format lint clean help
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -302,6 +304,18 @@ bench-error: deps
 
 run-bench-error: $(B)/render $(B)/bench_error
 	@$(B)/bench_error $(PRESET_$(PRESET)) --out out/bench-error-$(PRESET) $(ARGS)
+
+# Quick: about 10 minutes of one core. Full: half a day.
+study-kd: deps
+	$(SUB) run-study-kd
+
+run-study-kd: $(B)/render $(B)/imgerr $(B)/bench_error $(B)/study_kd
+	@BENCH_COMMIT="$$(git describe --always --dirty 2>/dev/null)" $(B)/study_kd --preset $(PRESET) $(ARGS)
+
+# Put its tables and pictures into the README.
+study-kd-readme:
+	@sh bench/readme.sh README.md out/study-kd-$(PRESET)/study_kd.md
+	@cp out/study-kd-$(PRESET)/cells-*.png examples/images/
 
 # ---- upkeep ---------------------------------------------------------------------------------------------------
 

@@ -221,25 +221,39 @@ static inline double bench_copy_ms(void)
     return ns * 1e-6;
 }
 
-/* What was measured, on what: the first lines of every benchmark. The Makefile tells flags and commit. */
-static inline void bench_print_machine(FILE *json)
+/* The processor's name. */
+static inline void bench_cpu(char *name, size_t size)
 {
-    char line[256], cpu[200] = "unknown CPU";
-    const char *flags = getenv("BENCH_FLAGS"), *commit = getenv("BENCH_COMMIT"), *compiler = "unknown";
+    char line[256];
     FILE *f = fopen("/proc/cpuinfo", "r");
+    snprintf(name, size, "unknown CPU");
     while (f && fgets(line, sizeof line, f))
         if (!strncmp(line, "model name", 10) && strchr(line, ':')) {
-            snprintf(cpu, sizeof cpu, "%s", strchr(line, ':') + 2);
-            cpu[strcspn(cpu, "\n")] = 0;
+            snprintf(name, size, "%s", strchr(line, ':') + 2);
+            name[strcspn(name, "\n")] = 0;
             break;
         }
     if (f)
         fclose(f);
+}
+
+static inline const char *bench_compiler(void)
+{
 #if defined(__clang__)
-    compiler = __VERSION__; /* names itself */
+    return __VERSION__; /* names itself */
 #elif defined(__GNUC__)
-    compiler = "gcc " __VERSION__;
+    return "gcc " __VERSION__;
+#else
+    return "unknown";
 #endif
+}
+
+/* What was measured, on what: the first lines of every benchmark. The Makefile tells flags and commit. */
+static inline void bench_print_machine(FILE *json)
+{
+    char cpu[200];
+    const char *flags = getenv("BENCH_FLAGS"), *commit = getenv("BENCH_COMMIT"), *compiler = bench_compiler();
+    bench_cpu(cpu, sizeof cpu);
     double small = bench_load_latency((size_t)1 << 18), middle = bench_load_latency((size_t)1 << 22);
     double large = bench_load_latency((size_t)1 << 26), read = bench_read_bandwidth();
     double fma = bench_fma_peak(), copy = bench_copy_ms();

@@ -603,7 +603,7 @@ int main(int argc, char **argv)
         return fputs(usage, stdout), 0;
     if (parse(&o, argc, argv) || check(&o))
         return 1;
-    snprintf(settings, sizeof settings, "size %s; max depth %d; nee %s; threads 1", o.size, o.max_depth, o.nee);
+    rows_settings(settings, sizeof settings, o.size, o.max_depth, o.nee);
     snprintf(path, sizeof path, "%s/rows.csv", o.plan.out);
     if (!rows_read(path, settings, &all, &cut, err, sizeof err))
         return die(err, NULL);

@@ -1,153 +1,11 @@
-/* error_report.h: from rows to tables, plots and verdicts.
-
-   Errors are averaged over seeds geometrically; ratios pair the seeds, and their 95 % intervals come from Student's t
-   on the logarithms. */
+/* error_report.h: from rows to tables, plots and verdicts. */
 #ifndef ERROR_REPORT_H
 #define ERROR_REPORT_H
 
-#include "error_rows.h"
+#include "error_means.h"
 #include "plot.h"
 #include "statistics.h"
 #include "tracer.h"
-
-#define MAX_NAMES 32
-
-typedef struct names {
-    char at[MAX_NAMES][128];
-    int count;
-} names;
-
-/* What is to be rendered: every scene x build x method x budget x seed. */
-typedef struct plan {
-    names scenes, builds, methods, budgets;
-    int seeds;
-    bool trained; /* budgets name a training: plots show the error against it */
-    const char *out;
-} plan;
-
-typedef struct estimate {
-    double value, low, high; /* geometric mean and its 95 % interval; NaN = nothing to tell */
-    int count;
-} estimate;
-
-/* 97.5 % quantile of Student's t. */
-static double student(int degrees)
-{
-    static const double t[] = {12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228};
-    return degrees < 1 ? (double)INFINITY : degrees <= 10 ? t[degrees - 1] : 2.0 + 2.3 / degrees;
-}
-
-static estimate geometric(const double *values, int n)
-{
-    estimate e = {(double)NAN, (double)NAN, (double)NAN, 0};
-    double sum = 0, squares = 0;
-    for (int i = 0; i < n; ++i)
-        if (isfinite(values[i]) && values[i] > 0) {
-            double l = log(values[i]);
-            sum += l;
-            squares += l * l;
-            e.count++;
-        }
-    if (!e.count)
-        return e;
-    double mean = sum / e.count;
-    e.value = exp(mean);
-    if (e.count > 1) {
-        double spread = sqrt(fmax(squares / e.count - mean * mean, 0) / (e.count - 1));
-        e.low = exp(mean - student(e.count - 1) * spread);
-        e.high = exp(mean + student(e.count - 1) * spread);
-    }
-    return e;
-}
-
-static const row *find_row(const rows *all, const char *scene, const char *build, const char *method,
-                           const char *budget, int seed)
-{
-    for (int i = 0; i < all->count; ++i) {
-        const row *r = &all->at[i];
-        if (r->seed == seed && row_ok(r) && !strcmp(r->scene, scene) && !strcmp(r->build, build) &&
-            !strcmp(r->method, method) && !strcmp(r->budget, budget))
-            return r;
-    }
-    return NULL;
-}
-
-typedef double (*row_value)(const row *r);
-static double value_relmse(const row *r) { return r->relmse; }
-static double value_mrae(const row *r) { return r->mrae; }
-static double value_spp(const row *r) { return r->spp; }
-static double value_seconds(const row *r) { return r->cpu_seconds; }
-static double value_train_spp(const row *r) { return r->train_spp; }
-static double value_train_seconds(const row *r) { return r->train_seconds; }
-static double value_denoise(const row *r) { return 100 * r->denoise_seconds / r->train_seconds; }
-static double value_speed(const row *r) { return r->spp / r->cpu_seconds; }
-static double value_efficiency(const row *r) { return 1 / (r->relmse * r->cpu_seconds); }
-
-typedef struct column { /* one build with one method */
-    const char *build, *method;
-} column;
-
-static estimate mean_of(const plan *p, const rows *all, const char *scene, column c, const char *budget, row_value of)
-{
-    double values[1000];
-    int n = 0;
-    for (int seed = 1; seed <= p->seeds && n < 1000; ++seed) {
-        const row *r = find_row(all, scene, c.build, c.method, budget, seed);
-        if (r)
-            values[n++] = of(r);
-    }
-    return geometric(values, n);
-}
-
-/* Of column a over column b, seed by seed. */
-static estimate ratio_of(const plan *p, const rows *all, const char *scene, column a, column b, const char *budget,
-                         row_value of)
-{
-    double values[1000];
-    int n = 0;
-    for (int seed = 1; seed <= p->seeds && n < 1000; ++seed) {
-        const row *ra = find_row(all, scene, a.build, a.method, budget, seed);
-        const row *rb = find_row(all, scene, b.build, b.method, budget, seed);
-        if (ra && rb)
-            values[n++] = of(ra) / of(rb);
-    }
-    return geometric(values, n);
-}
-
-/* Over several scenes; their number is mean.count. */
-typedef struct overall {
-    estimate mean;
-    double lowest, highest; /* scene */
-} overall;
-
-/* Of column a over column b, all scenes together: geometric mean of the scenes' ratios. The interval is that of chance
-   between seeds, for these scenes: the variances of the scenes' means add up, degrees of freedom by Welch and
-   Satterthwaite. */
-static overall overall_ratio(const plan *p, const rows *all, column a, column b, const char *budget, row_value of)
-{
-    overall o = {{(double)NAN, (double)NAN, (double)NAN, 0}, (double)INFINITY, 0};
-    double sum = 0, variance = 0, degrees = 0;
-    for (int s = 0; s < p->scenes.count; ++s) {
-        estimate e = ratio_of(p, all, p->scenes.at[s], a, b, budget, of);
-        if (!e.count)
-            continue;
-        double error = log(e.high / e.low) / (2 * student(e.count - 1)); /* NaN with one seed: no interval then */
-        sum += log(e.value);
-        variance += error * error;
-        degrees += error * error * error * error / (e.count - 1);
-        o.lowest = fmin(o.lowest, e.value);
-        o.highest = fmax(o.highest, e.value);
-        o.mean.count++;
-    }
-    if (!o.mean.count)
-        return o;
-    double mean = sum / o.mean.count, error = sqrt(variance) / o.mean.count;
-    degrees = degrees > 0 ? variance * variance / degrees : 1; /* >= 1, but for rounding */
-    o.mean.value = exp(mean);
-    o.mean.low = exp(mean - student((int)(degrees + 1e-6)) * error);
-    o.mean.high = exp(mean + student((int)(degrees + 1e-6)) * error);
-    return o;
-}
 
 /* ---- bias: do two methods' pictures agree? */
 
@@ -166,15 +24,6 @@ static void evidence_free(evidence *e)
     free(e->variance[0]);
     free(e->variance[1]);
     memset(e, 0, sizeof *e);
-}
-
-static void picture_path(char *path, size_t size, const char *out, const char *kind, const row *r, const char *end)
-{
-    int n = snprintf(path, size, "%s/%s/%s-%s-%s-%s-%d%s", out, kind, r->scene, r->build, r->method, r->budget, r->seed,
-                     end);
-    for (int i = (int)strlen(out) + (int)strlen(kind) + 2; i < n && i < (int)size - 1; ++i)
-        if (path[i] == ':' || path[i] == '=' || path[i] == '/')
-            path[i] = '_';
 }
 
 static void evidence_add(evidence *e, const tr_image *color, const tr_image *variance, double spp, int half)

@@ -26,7 +26,13 @@
     X(bytes)                                                                                                           \
     X(train_spp)                                                                                                       \
     X(train_seconds)                                                                                                   \
-    X(denoise_seconds)
+    X(denoise_seconds)                                                                                                 \
+    X(structure_seconds)                                                                                               \
+    X(samples)                                                                                                         \
+    X(zeros)                                                                                                           \
+    X(lookahead_cells)                                                                                                 \
+    X(levels)                                                                                                          \
+    X(lobes)
 
 typedef struct row {
     char scene[64], build[32], method[128];
@@ -43,7 +49,7 @@ typedef struct rows {
     int count, capacity;
 } rows;
 
-static bool rows_add(rows *all, const row *r)
+static inline bool rows_add(rows *all, const row *r)
 {
     if (all->count == all->capacity) {
         int capacity = all->capacity ? 2 * all->capacity : 64;
@@ -57,15 +63,21 @@ static bool rows_add(rows *all, const row *r)
     return true;
 }
 
-static bool row_same_task(const row *a, const row *b)
+static inline bool row_same_task(const row *a, const row *b)
 {
     return !strcmp(a->scene, b->scene) && !strcmp(a->build, b->build) && !strcmp(a->method, b->method) &&
            !strcmp(a->budget, b->budget) && a->seed == b->seed;
 }
 
-static bool row_ok(const row *r) { return !strcmp(r->status, "ok"); }
+/* What rows of one file have in common. */
+static inline void rows_settings(char *text, size_t size, const char *picture, int max_depth, const char *nee)
+{
+    snprintf(text, size, "size %s; max depth %d; nee %s; threads 1", picture, max_depth, nee);
+}
 
-static void row_print_csv(FILE *f, const row *r)
+static inline bool row_ok(const row *r) { return !strcmp(r->status, "ok"); }
+
+static inline void row_print_csv(FILE *f, const row *r)
 {
     fprintf(f, "%s,%s,%s,%s,%d,%s", r->scene, r->build, r->method, r->budget, r->seed, r->status);
 #define ROW_PRINT(name)                                                                                                \
@@ -78,7 +90,7 @@ static void row_print_csv(FILE *f, const row *r)
     fputc('\n', f);
 }
 
-static void rows_print_header(FILE *f, const char *settings)
+static inline void rows_print_header(FILE *f, const char *settings)
 {
     fprintf(f, "# %s\nscene,build,method,budget,seed,status", settings);
 #define ROW_NAME(name) fputs("," #name, f);
@@ -88,7 +100,7 @@ static void rows_print_header(FILE *f, const char *settings)
 }
 
 /* The next field of a line, "" at its end; commas do not occur inside fields. */
-static const char *csv_field(char **line)
+static inline const char *csv_field(char **line)
 {
     char *start = *line ? *line : (char *)"";
     char *comma = strchr(start, ',');
@@ -98,7 +110,7 @@ static const char *csv_field(char **line)
     return start;
 }
 
-static double csv_number(char **line)
+static inline double csv_number(char **line)
 {
     const char *text = csv_field(line);
     char *end;
@@ -106,7 +118,7 @@ static double csv_number(char **line)
     return end == text || *end ? (double)NAN : value;
 }
 
-static bool row_parse(char *line, row *r)
+static inline bool row_parse(char *line, row *r)
 {
     memset(r, 0, sizeof *r);
     snprintf(r->scene, sizeof r->scene, "%.63s", csv_field(&line));
@@ -125,7 +137,7 @@ static bool row_parse(char *line, row *r)
 
 /* Rows of an earlier run; none where there is no file. False, with a message: made with other settings, or unreadable.
    A last line that was cut off is dropped, and told in *cut: the caller writes the file anew. */
-static bool rows_read(const char *path, const char *settings, rows *all, bool *cut, char *err, size_t err_size)
+static inline bool rows_read(const char *path, const char *settings, rows *all, bool *cut, char *err, size_t err_size)
 {
     FILE *f = fopen(path, "r");
     char line[1024];
@@ -156,7 +168,7 @@ static bool rows_read(const char *path, const char *settings, rows *all, bool *c
     return true;
 }
 
-static bool rows_write(const char *path, const char *settings, const rows *all)
+static inline bool rows_write(const char *path, const char *settings, const rows *all)
 {
     FILE *f = fopen(path, "w");
     if (!f)
@@ -167,7 +179,7 @@ static bool rows_write(const char *path, const char *settings, const rows *all)
     return fclose(f) == 0;
 }
 
-static bool rows_write_json(const char *path, const rows *all)
+static inline bool rows_write_json(const char *path, const rows *all)
 {
     FILE *f = fopen(path, "w");
     if (!f)
@@ -191,7 +203,7 @@ static bool rows_write_json(const char *path, const rows *all)
 }
 
 /* The number after "key": in a JSON text that holds the key once; NaN where it is not there. */
-static double json_find(const char *text, const char *key)
+static inline double json_find(const char *text, const char *key)
 {
     char quoted[64];
     snprintf(quoted, sizeof quoted, "\"%s\":", key);
@@ -204,7 +216,7 @@ static double json_find(const char *text, const char *key)
 }
 
 /* Fill in the numbers from the renderer's statistics; false = no such file. */
-static bool row_read_json(const char *path, row *r)
+static inline bool row_read_json(const char *path, row *r)
 {
     FILE *f = fopen(path, "r");
     static char text[1 << 16];
@@ -220,6 +232,17 @@ static bool row_read_json(const char *path, row *r)
     ROW_NUMBERS(ROW_FIND)
 #undef ROW_FIND
     return isfinite(r->spp) && isfinite(r->cpu_seconds);
+}
+
+/* out/kind/SCENE-BUILD-METHOD-BUDGET-SEED.end */
+static inline void picture_path(char *path, size_t size, const char *out, const char *kind, const row *r,
+                                const char *end)
+{
+    int n = snprintf(path, size, "%s/%s/%s-%s-%s-%s-%d%s", out, kind, r->scene, r->build, r->method, r->budget, r->seed,
+                     end);
+    for (int i = (int)strlen(out) + (int)strlen(kind) + 2; i < n && i < (int)size - 1; ++i)
+        if (path[i] == ':' || path[i] == '=' || path[i] == '/')
+            path[i] = '_';
 }
 
 #endif

@@ -1,7 +1,7 @@
 #!/bin/sh
-# readme.sh README.md JSON...: put the rows of microbenchmarks between the README's lines <!-- NAME.json --> and
-# <!-- end -->, as a table. Rows of kernels without a goal are left out, as are fields other than sf1: the benchmarks
-# print them.
+# readme.sh README.md FILE...: put the rows of microbenchmarks (NAME.json) between the README's lines <!-- NAME.json -->
+# and <!-- end -->, as a table; of a file NAME.md, the whole text. Rows of kernels without a goal are left out, as are
+# fields other than sf1: the benchmarks print them.
 readme=$1
 shift
 for json in "$@"; do
@@ -17,6 +17,7 @@ for json in "$@"; do
             match(rest, /^[-+0-9.a-z]+/)
             return substr(rest, 1, RLENGTH)
         }
+        FNR == NR && name ~ /\.md$/ { text = text $0 "\n"; next }
         FNR == NR {
             if (index($0, "\"machine\"")) {
                 machine = value($0, "cpu") ", " value($0, "compiler") ", commit " value($0, "commit") "; FMA " \
@@ -46,6 +47,11 @@ for json in "$@"; do
         }
         $0 == "<!-- " name " -->" {
             print
+            if (text) {
+                printf "%s\n", text
+                skip = 1
+                next
+            }
             if (methods) {
                 printf "\n%s.\n\n| method |%s ns/sample | ns/query | cells | KiB |\n|---|", machine, sizes
                 for (i = gsub(/\|/, "|", sizes) + 4; i > 0; --i) printf "---|"
@@ -61,5 +67,5 @@ for json in "$@"; do
         }
         $0 == "<!-- end -->" { skip = 0 }
         !skip { print }' "$json" "$readme" >"$readme.new" && mv "$readme.new" "$readme" || exit 1
-    echo "$readme: table of $name rewritten"
+    echo "$readme: what is in $name rewritten"
 done

@@ -101,4 +101,33 @@ report $? '--train: rows, plots, and the share of the denoise step'
     [ "$(grep '^| cornell | 4+4spp | sdtree (a) ' "$table" | cut -d '|' -f 10)" = "$(grep '^| 4+4spp | sdtree (a) ' "$table" | cut -d '|' -f 5)" ]
 report $? 'the geometric mean over one scene is that of the scene, and so is its interval'
 
+# The study of splits: its means are those of the rows, smaller thresholds make more cells, the field that only takes the
+# time has the same cells, and what was rendered is not rendered again.
+study() {
+    "$build/study_kd" --preset tiny --out "$tmp/study" --only thresholds,resolution "$@" >"$tmp/log" 2>&1
+    status=$?
+}
+study
+csv=$tmp/study/study_kd.csv
+awk -F, '
+    function close_to(a, b) { return a > b * 0.9999 && a < b * 1.0001 }
+    FNR == 1 || /^#/ { next }
+    FILENAME ~ /rows.csv/ { if ($1 == "scene") next; key = $1 "," $3; sum[key] += log($15); n[key]++; next }
+    $1 == "thresholds" { lines++; key = $2 "," $7; ok += n[key] == 2 && $8 == 2 && close_to($9, exp(sum[key] / 2))
+        if ($6 != "signatures") { more += $15 > cells[$2]; cells[$2] = $15 }
+        ahead += ($6 == "signatures") == ($18 > 0) }
+    END { print lines, ok, more, ahead; exit !(lines == 12 && ok == 12 && more == 10 && ahead == 12) }
+' "$tmp/study/80x45-nee-on/rows.csv" "$csv" >>"$tmp/log" && [ $status -eq 0 ] &&
+    awk '/"cells": / { cells = $2 + 0 } /"structure_cells": / { sub(/.*"structure_cells": /, ""); exit $0 + 0 != cells || !cells }' \
+        "$tmp"/study/80x45-nee-on/pictures/cornell-render-kd_time_structure_on-8+4spp-1.json
+report $? 'study_kd: means of the rows, cells by thresholds, the same cells without mixtures'
+grep -q '^| pool | .* % |$' "$tmp/study/study_kd.md" && grep -q '^MRAE at most 1.02 .* of 2 lines' "$tmp/study/study_kd.md" &&
+    [ -s "$tmp/study/cells-pool.png" ] && grep -q '</svg>' "$tmp/study/mrae-cells-pool.svg" &&
+    grep -q '"nee": "on".*"mrae_95": \[' "$tmp/study/study_kd.json"
+report $? 'study_kd: tables, plots and pictures of cells are written'
+cp "$csv" "$tmp/first.csv"
+study
+[ $status -eq 0 ] && [ "$(grep -c ': 0 renders to do' "$tmp/log")" -eq 3 ] && cmp "$csv" "$tmp/first.csv" >>"$tmp/log"
+report $? 'study_kd: a second run renders nothing and says the same'
+
 finish

@@ -217,6 +217,15 @@ report $? 'imgerr: regions of an image have the means of themselves'
 "$imgerr" --regions one.exr one.exr -5 >out 2>log
 [ $? -eq 1 ] && grep -q 'bad clamp "-5"' log
 report $? 'imgerr: a bad clamp is named'
+for n in 64 1000000; do # many cells, and one
+    "$render" good.xml --method kd --set split=count --set count=$n --spp 8 --quiet -o kd$n.exr &&
+        "$imgerr" --cells kd$n.png kd$n.exr cells || break
+done >out 2>log
+"$imgerr" --cells again.png kd64.exr cells >>out 2>>log && cmp kd64.png again.png && ! cmp -s kd64.png kd1000000.png
+report $? 'imgerr: cells in false colours'
+"$imgerr" --cells cells.png kd64.png none >out 2>log
+[ $? -eq 1 ] && [ ! -e cells.png ] && [ -s log ]
+report $? 'imgerr: no picture of cells where there is no such layer'
 "$imgerr" >out 2>log
 [ $? -eq 1 ] && grep -qi usage log
 report $? 'imgerr: usage'

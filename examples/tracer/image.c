@@ -203,14 +203,19 @@ static int find_channel(const exr_attr_chlist_t *list, const char *prefix, size_
 
 static const char *const rgb_names[3] = {"R", "G", "B"};
 
-/* The channels of a layer by its name; false = it has no R, G and B. */
+/* The channels of a layer by its name: R, G, B, else X, Y, Z, else Y; false = it has none of these. */
 static bool choose_layer(const exr_attr_chlist_t *list, const char *layer, int rgb[3])
 {
+    static const char *const names[3][3] = {{"R", "G", "B"}, {"X", "Y", "Z"}, {"Y", "Y", "Y"}};
     char prefix[256];
     int length = snprintf(prefix, sizeof prefix, "%s.", layer);
-    for (int c = 0; c < 3; ++c)
-        rgb[c] = find_channel(list, prefix, (size_t)length, rgb_names[c]);
-    return rgb[0] >= 0 && rgb[1] >= 0 && rgb[2] >= 0;
+    for (int kind = 0; kind < 3; ++kind) {
+        for (int c = 0; c < 3; ++c)
+            rgb[c] = find_channel(list, prefix, (size_t)length, names[kind][c]);
+        if (rgb[0] >= 0 && rgb[1] >= 0 && rgb[2] >= 0)
+            return true;
+    }
+    return false;
 }
 
 /* Which channels hold the colour: R, G, B; else Y; else those of the first layer that has them; else the first channel
@@ -327,7 +332,7 @@ static bool read_exr_header(exr_reader *r, const char *path, exr_storage_t *stor
     if (!r->layer)
         choose_channels(channels, r->rgb);
     else if (!choose_layer(channels, r->layer, r->rgb))
-        return fail(err, err_size, "%s: no layer \"%.100s\" with R, G and B", path, r->layer);
+        return fail(err, err_size, "%s: no layer \"%.100s\" with R, G and B, or X, Y and Z, or Y", path, r->layer);
     for (int c = 0; c < 3; ++c) {
         const exr_attr_chlist_entry_t *e = &channels->entries[r->rgb[c]];
         if (e->x_sampling != 1 || e->y_sampling != 1)

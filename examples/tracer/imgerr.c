@@ -3,6 +3,7 @@
    imgerr A.exr REF.exr                                    relMSE and MRAE, trimmed and untrimmed
    imgerr --compare OUT.png IMAGE.exr LABEL [IMAGE LABEL]...   side by side at one exposure
    imgerr --to-png IMAGE.exr OUT.png [EXPOSURE]             tone-mapped
+   imgerr --cells OUT.png IMAGE.exr LABEL [IMAGE LABEL]...     cells of the guiding field in false colours, side by side
    imgerr --heat OUT.png IMAGE.exr REF.exr                  relative error per pixel: black 0, white 1 and more
    imgerr --regions IMAGE.exr REF.exr [CLAMP]               means of 6 x 4 regions over the reference's; any two sizes
  */
@@ -30,6 +31,7 @@
 static const char usage[] = "usage: imgerr IMAGE.exr REFERENCE.exr\n"
                             "       imgerr --compare OUT.png IMAGE.exr LABEL [IMAGE.exr LABEL]...\n"
                             "       imgerr --to-png IMAGE.exr OUT.png [EXPOSURE]\n"
+                            "       imgerr --cells OUT.png IMAGE.exr LABEL [IMAGE.exr LABEL]...\n"
                             "       imgerr --heat OUT.png IMAGE.exr REFERENCE.exr\n"
                             "       imgerr --regions IMAGE.exr REFERENCE.exr [CLAMP]\n";
 
@@ -129,7 +131,46 @@ static bool join(tr_image *images, const char *const *labels, int count, tr_imag
     return true;
 }
 
-static int compare(const char *out_path, char **args, int count)
+typedef bool (*image_reader)(const char *path, tr_image *image, char *err, size_t err_size);
+
+static bool read_colour(const char *path, tr_image *image, char *err, size_t err_size)
+{
+    return tr_image_read(path, false, image, err, err_size);
+}
+
+/* A colour of its own for every number; neighbours in the tree, which have numbers far apart or next to each other,
+   differ. Hue by the golden ratio, three lightnesses. */
+static vec3 cell_colour(float cell)
+{
+    float hue = 6 * (float)fmod(0.61803398875 * (double)cell, 1), light = 0.35f + 0.3f * (float)fmod((double)cell, 3);
+    vec3 c = v3(clampf(fabsf(hue - 3) - 1, 0, 1), clampf(2 - fabsf(hue - 2), 0, 1), clampf(2 - fabsf(hue - 4), 0, 1));
+    return v3(light * (0.15f + 0.85f * c.x), light * (0.15f + 0.85f * c.y), light * (0.15f + 0.85f * c.z));
+}
+
+/* Cells in false colours, shaded by the normals so that the scene can be made out. */
+static bool read_cells(const char *path, tr_image *image, char *err, size_t err_size)
+{
+    tr_image normal;
+    if (!tr_exr_read_layer(path, "cell", image, err, err_size))
+        return false;
+    if (!tr_exr_read_layer(path, "normal", &normal, err, err_size)) {
+        tr_image_free(image);
+        return false;
+    }
+    for (size_t i = 0, n = (size_t)image->width * (size_t)image->height; i < n; ++i) {
+        float *p = image->data + 3 * i, *d = normal.data + 3 * i;
+        float shade = 0.55f + 0.2f * (d[0] + d[1]) + 0.05f * d[2]; /* light from above, and from one side */
+        vec3 c = isfinite(p[0]) ? cell_colour(p[0]) : v3(0, 0, 0);
+        p[0] = c.x * shade;
+        p[1] = c.y * shade;
+        p[2] = c.z * shade;
+    }
+    tr_image_free(&normal);
+    return true;
+}
+
+/* exposure 0: that of the last picture, which is the best one by custom (the reference). */
+static int compare(const char *out_path, char **args, int count, image_reader read, float exposure)
 {
     tr_image images[MAX_COLUMNS], all = {0};
     const char *labels[MAX_COLUMNS];
@@ -140,14 +181,14 @@ static int compare(const char *out_path, char **args, int count)
         return complain("too many pictures", "16 at most");
     bool ok = true;
     for (; loaded < columns; ++loaded) {
-        ok = tr_image_read(args[2 * loaded], false, &images[loaded], err, sizeof err);
+        ok = read(args[2 * loaded], &images[loaded], err, sizeof err);
         if (!ok)
             break;
         labels[loaded] = args[2 * loaded + 1];
     }
     if (ok) {
-        /* The last picture is the best one by custom (the reference), so it sets the exposure. */
-        float exposure = tr_auto_exposure(&images[columns - 1]);
+        if (!(exposure > 0))
+            exposure = tr_auto_exposure(&images[columns - 1]);
         snprintf(err, sizeof err, "%s: the pictures together are too large", out_path);
         ok = join(images, labels, columns, &all, exposure) && tr_png_write(out_path, &all, exposure, err, sizeof err);
     }
@@ -268,7 +309,9 @@ int main(int argc, char **argv)
     if (argc == 3 && argv[1][0] != '-')
         return print_errors(argv[1], argv[2]);
     if (argc >= 5 && argc % 2 == 1 && strcmp(argv[1], "--compare") == 0)
-        return compare(argv[2], argv + 3, argc - 3);
+        return compare(argv[2], argv + 3, argc - 3, read_colour, 0);
+    if (argc >= 5 && argc % 2 == 1 && strcmp(argv[1], "--cells") == 0)
+        return compare(argv[2], argv + 3, argc - 3, read_cells, 1);
     if ((argc == 4 || argc == 5) && strcmp(argv[1], "--to-png") == 0)
         return to_png(argv[2], argv[3], argc == 5 ? argv[4] : NULL);
     if (argc == 5 && strcmp(argv[1], "--heat") == 0)

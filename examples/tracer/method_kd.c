@@ -5,8 +5,9 @@
    criteria=both|radiance|direction, tests=own|published, keep_signatures (0 .. 1), max_levels, max_lobes,
    update_samples, max_memory_mb, learn_alpha=grid|off (on = grid), alpha, gate=on|off, gate_margin, gate_gain,
    gate_probe, uniform, simd=scalar|avx2|avx512|neon, product=on|off (with the cosine), parallax=on|off (lobes know
-   distances), jitter=on|off (find looks up a jittered position), sparse=on|off (closed fields record only some tiles).
- */
+   distances), jitter=on|off (find looks up a jittered position), sparse=on|off (closed fields record only some tiles),
+   time_structure=on|off (a second field without mixtures learns from the same samples: its CPU seconds are the price of
+   the tree and its signatures, sorting of the samples included). */
 #include "method_options.h"
 #include "threads.h"
 
@@ -15,10 +16,12 @@
 
 typedef struct kd {
     gkd_field *field;
+    gkd_field *structure; /* time_structure: the same tree alone; else NULL */
+    double structure_seconds;
     gkd_view view;
     gkd_stream **streams;
     int tiles;
-    bool product, jitter, sparse, parallax;
+    bool product, jitter, sparse, parallax, time_structure;
     float fraction; /* of the tiles that record in this pass */
     int pass;
     uint64_t stream_peak;
@@ -60,6 +63,7 @@ static bool parse(parser *p, gkd_desc *d, kd *m)
     m->parallax = choice(p, "parallax", "off|on") != 0;
     m->jitter = choice(p, "jitter", "off|on") == 1;
     m->sparse = choice(p, "sparse", "off|on") != 0;
+    m->time_structure = choice(p, "time_structure", "off|on") == 1;
     return p->ok;
 }
 
@@ -74,6 +78,7 @@ static void kd_destroy(void *method)
         gkd_stream_destroy(m->streams[i]);
     free(m->streams);
     gkd_destroy(m->field);
+    gkd_destroy(m->structure);
     free(m);
 }
 
@@ -97,6 +102,9 @@ static void *kd_create(tr_method_env *env, char *err, size_t err_size)
         return NULL;
     }
     gkd_result result = gkd_create(&desc, &m->field);
+    desc.no_mixtures = true;
+    if (!result && m->time_structure)
+        result = gkd_create(&desc, &m->structure);
     m->streams = result ? NULL : calloc((size_t)m->tiles, sizeof *m->streams);
     for (int i = 0; m->streams && i < m->tiles && !result; ++i)
         result = gkd_stream_create(m->field, &m->streams[i]);
@@ -160,6 +168,23 @@ static bool kd_record(void *method, int tile, const tr_vertex *vertices, int n)
     return ok;
 }
 
+/* What the field was given, for the field without mixtures. */
+static void structure_accumulate(kd *m)
+{
+    double start = tr_cpu_seconds();
+    if (m->structure)
+        gkd_accumulate(m->structure, m->streams, (uint32_t)m->tiles, m->parallel, m->parallel_user);
+    m->structure_seconds += tr_cpu_seconds() - start;
+}
+
+static gkd_result structure_refine(kd *m)
+{
+    double start = tr_cpu_seconds();
+    gkd_result result = m->structure ? gkd_refine(m->structure, NULL, m->parallel, m->parallel_user) : GKD_OK;
+    m->structure_seconds += tr_cpu_seconds() - start;
+    return result;
+}
+
 static void kd_flush(void *method)
 {
     kd *m = method;
@@ -168,6 +193,7 @@ static void kd_flush(void *method)
         bytes += gkd_stream_size(m->streams[i]) * sizeof(gkd_training_sample);
     m->stream_peak = bytes > m->stream_peak ? bytes : m->stream_peak;
     gkd_accumulate(m->field, m->streams, (uint32_t)m->tiles, m->parallel, m->parallel_user); /* losses: in the stats */
+    structure_accumulate(m);
     for (int i = 0; i < m->tiles; ++i)
         gkd_stream_clear(m->streams[i]);
 }
@@ -180,6 +206,8 @@ static bool kd_end_pass(void *method, const tr_pass *pass)
         return true;
     kd_flush(m);
     gkd_result result = gkd_refine(m->field, &info, m->parallel, m->parallel_user);
+    if (!result)
+        result = structure_refine(m);
     m->view = gkd_get_view(m->field);
     return !result;
 }
@@ -261,6 +289,12 @@ static void kd_stats(void *method, tr_method_stats *stats)
              (unsigned long long)s.denied_splits, (unsigned long long)s.fits, s.open_cells, s.closed_cells,
              s.unjudged_cells, (unsigned long long)s.opened, (unsigned long long)s.closed, (unsigned long long)s.probed,
              (double)s.closed_share, (double)s.mean_alpha, (double)gkd_record_fraction(m->field));
+    if (m->structure) {
+        size_t n = strlen(stats->json);
+        gkd_get_stats(m->structure, &s);
+        snprintf(stats->json + n, sizeof stats->json - n, ", \"structure_seconds\": %.6g, \"structure_cells\": %u",
+                 m->structure_seconds, s.cells);
+    }
 }
 
 const tr_method tr_method_kd = {.name = "kd",

@@ -68,7 +68,8 @@ void tr_image_free(tr_image *image);
 /* Read the RGB (or Y) of an EXR (OpenEXR C core), or an LDR/HDR picture (stb_image; 8-bit files are decoded from sRGB
    to linear unless `raw`). On failure returns false and writes a one-line reason to err. Safe against broken files. */
 bool tr_image_read(const char *path, bool raw, tr_image *image, char *err, size_t err_size);
-/* The channels layer.R, layer.G, layer.B of an EXR; fails where they are not there. */
+/* The channels layer.R, layer.G, layer.B of an EXR, else layer.X, .Y, .Z, else layer.Y thrice; fails where there are
+   none of these. */
 bool tr_exr_read_layer(const char *path, const char *layer, tr_image *image, char *err, size_t err_size);
 /* Half-float (or float) scanline EXR, ZIP compression, all layers of one size. */
 bool tr_exr_write(const char *path, const tr_layer *layers, int layer_count, char *err, size_t err_size);
