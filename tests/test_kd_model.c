@@ -478,6 +478,26 @@ static void test_numbers_are_used_to_the_last_bit(void **state)
     BELOW(fabs(sum / n * 1e5 / 2 - 1), 0.15); /* mean of r^2 is 2 / kappa */
     BELOW((double)first, 1e-7);
     assert_true(last > 5 * 2e-5f);
+    /* a lobe that 17 numbers choose is drawn from at many more distances to its mean */
+    static float seen[17 * 64];
+    uint32_t apart_by = 0, count = 0;
+    l[0].weight = 1 - 1e-6f;
+    l[1].weight = 1e-6f;
+    handle_of(&h, l, 2, origin, NULL, true, 0.01f);
+    for (uint32_t i = 16777216 - 30; i < 16777216; ++i)
+        for (int j = 0; j < 64; ++j) {
+            float u[2] = {(float)i * 0x1p-24f, (float)j / 64}, w[3];
+            gkd_sample(&h, u, w);
+            if (w[2] < -0.9f && count < sizeof seen / sizeof *seen)
+                seen[count++] = w[0] * w[0] + w[1] * w[1];
+        }
+    for (uint32_t i = 0; i < count; ++i) {
+        bool fresh = true;
+        for (uint32_t j = 0; j < i; ++j)
+            fresh = fresh && fabsf(seen[i] - seen[j]) > 1e-6f * seen[i];
+        apart_by += fresh;
+    }
+    assert_true(count > 500 && apart_by > count / 2);
 }
 
 /* ---- cosine */
