@@ -17,8 +17,8 @@ static double integral(const gkd_handle *h)
     enum { RINGS = 8, TURNS = 4 };
     double e = (double)h->uniform, sum = 0, before = 0;
     for (uint32_t k = 0; k < h->count; ++k) {
-        const gkd_lobe_block *b = &h->block[k / 16];
-        uint32_t j = k % 16;
+        const gkd_lobe_block *b = &h->block[k / 8];
+        uint32_t j = k % 8;
         double weight = (double)b->upper[j] - before, part = 0;
         gkd_draw draw = {{b->x[j], b->y[j], b->z[j]}, b->falloff[j] * (2 * GKD_LN2), {0, 0, 0}, 0, 0};
         before = (double)b->upper[j];
@@ -30,8 +30,8 @@ static double integral(const gkd_handle *h)
             draw.turn = ((float)(i % TURNS) + 0.37f) / TURNS;
             gkd_draw_direction(&draw, w);
             for (uint32_t l = 0; l < h->count; ++l) {
-                const gkd_lobe_block *c = &h->block[l / 16];
-                uint32_t o = l % 16;
+                const gkd_lobe_block *c = &h->block[l / 8];
+                uint32_t o = l % 8;
                 double x = (double)w[0] - (double)c->x[o], y = (double)w[1] - (double)c->y[o],
                        z = (double)w[2] - (double)c->z[o], kappa = (double)c->falloff[o] * 2 * log(2), p, up, down;
                 up = x * x + y * y + z * z;

@@ -171,8 +171,8 @@ static reference of_handle(const gkd_handle *h)
     if (r.surface)
         unit(r.normal);
     for (uint32_t k = 0; k < h->count; ++k) {
-        const gkd_lobe_block *b = &h->block[k / 16];
-        uint32_t i = k % 16;
+        const gkd_lobe_block *b = &h->block[k / 8];
+        uint32_t i = k % 8;
         const float mean[3] = {b->x[i], b->y[i], b->z[i]};
         doubles(mean, r.mean[k]);
         unit(r.mean[k]);
