@@ -97,6 +97,9 @@ refuses '--train that takes all of the seconds' 'training.*seconds' good.xml --m
 refuses 'denoise_when=last without a training' 'denoise_when.*--train' good.xml --method sdtree --set denoise_when=last $quick
 refuses 'denoise_when=last without denoising' 'denoise_when.*denoise=on' good.xml --method sdtree --train 4 --set denoise=off \
     --set denoise_when=last $quick
+refuses 'save without a training' 'save.*--train' good.xml --method sdtree --set save=never.gsd $quick
+refuses 'compare without a training' 'compare.*--train' good.xml --method sdtree --set compare=good.xml $quick
+refuses 'compare with what is no field' 'compare.*save=FILE' good.xml --method sdtree --train 4 --set compare=good.xml $quick
 completes '--help' --help
 grep -q -- '--method' out && grep -q -- '--seconds' out
 report $? '--help lists the options'
@@ -193,6 +196,20 @@ grep -q '"spp": 8,' last.json && grep -q '"train_spp": 12,' last.json && grep -q
     awk '/"cpu_seconds"/ && !all { all = $2 + 0 } /"train_seconds"/ { sum += $2 } /"render_seconds"/ { sum += $2 }
         END { exit !(all > 0 && sum > 0.999 * all && sum < 1.001 * all) }' last.json
 report $? '--train: JSON tells the training and the picture apart, their seconds add up'
+# Fields compared by the same samples: one is as good as itself, and what another gains over it is lost the other way.
+for when in last never; do
+    [ $when = last ] && set=denoise_when=last || set=denoise=off
+    "$render" $train --set $set --set save=$when.gsd -o x.exr >out 2>log
+done
+for when in last never; do
+    [ $when = last ] && set=denoise_when=last || set=denoise=off
+    "$render" $train --set $set --set compare=last.gsd,never.gsd -o x.exr --json $when.json >out 2>log
+done
+compared() { sed -n 's/.*"compared": \[\([^,]*\), \([^]]*\)\].*/\1 \2/p' $1.json; }
+{ compared last && compared never; } | tee log |
+    awk '{ a[NR] = $1; b[NR] = $2 }
+        END { exit !(NR == 2 && a[1] > 0.9999 && a[1] < 1.0001 && b[2] > 0.9999 && b[2] < 1.0001 && b[1] != 1 && b[1] * a[2] > 0.98 && b[1] * a[2] < 1.02) }'
+report $? 'compare: ratios of fields by the same samples'
 completes '--train with a budget in seconds' good.xml --method sdtree --train 2 --seconds 0.5 --quiet
 completes '--quiet says nothing' good.xml $quick -o quiet.exr
 [ ! -s out ] && [ ! -s log ]

@@ -7,24 +7,35 @@
    denoise_budget, denoise_when=training|last (in every refine, or only in that which ends --train); of
    denoise=gaussian: sigma, gaussian_rho, gaussian_sphere=off|on, gaussian_limit=on|off; uniform, alias=on|off,
    simd=scalar|avx2|avx512|neon, product=on|off (with the cosine), jitter=on|off (find looks up a jittered position),
-   sparse=on|off (closed fields record only some tiles). */
+   sparse=on|off (closed fields record only some tiles). With --train: save=FILE writes the field when the training
+   ends; compare=FILE,FILE,... judges such fields by the samples of the picture, see >>rivals. */
 #include "method_options.h"
 #include "threads.h"
 
 #define GSD_IMPLEMENTATION
 #include "guide_sdtree.h"
 
+/* Another field, and by image tile the sums of the second moments that the samples have in their own and under it. */
+typedef struct rival {
+    gsd_field *field;
+    gsd_view view;
+    double *own, *other; /* [tiles] */
+} rival;
+
 typedef struct sdtree {
     gsd_field *field;
     gsd_view view;
     gsd_stream **streams;
     int tiles;
-    bool product, jitter, sparse, denoise_last;
+    bool product, jitter, sparse, denoise_last, frozen;
     float fraction; /* of the tiles that record in this pass */
     int pass;
     uint64_t stream_peak;
     tr_parallel_fn parallel;
     void *parallel_user;
+    FILE *save;
+    rival *rivals;
+    int rival_count;
     double denoise_start; /* CPU seconds when refine's denoise step began; 0 = it is not there */
     double denoise_seconds;
 } sdtree;
@@ -74,6 +85,130 @@ static bool parse(parser *p, gsd_desc *d, sdtree *m)
     return p->ok;
 }
 
+/* ---- >>rivals: fields compared by the same samples
+
+   A sample's direction had the density p; under another field it would have had q = alpha pdf_bsdf + (1 - alpha)
+   pdf_guide. The mean of (contribution to the pixel / pixel estimate)^2 / (p q) is the second moment that the other
+   field would have had. Its ratio to that of 1 / p^2 has little noise, since both come from the same samples. */
+
+static void rivals_free(sdtree *m)
+{
+    for (int i = 0; i < m->rival_count; ++i) {
+        gsd_destroy(m->rivals[i].field);
+        free(m->rivals[i].own);
+    }
+    free(m->rivals);
+}
+
+static gsd_field *load_field(const char *path)
+{
+    gsd_field *field = NULL;
+    FILE *f = fopen(path, "rb");
+    long size = f && !fseek(f, 0, SEEK_END) ? ftell(f) : -1;
+    void *data = size > 0 ? malloc((size_t)size) : NULL;
+    if (data && !fseek(f, 0, SEEK_SET) && fread(data, 1, (size_t)size, f) == (size_t)size)
+        gsd_load(NULL, data, (size_t)size, &field);
+    free(data);
+    if (f)
+        fclose(f);
+    return field;
+}
+
+static bool save_field(sdtree *m)
+{
+    size_t size = gsd_save_bound(m->field);
+    void *data = malloc(size);
+    bool ok = data && !gsd_save(m->field, data, size, &size) && fwrite(data, 1, size, m->save) == size;
+    free(data);
+    ok = !fclose(m->save) && ok;
+    m->save = NULL;
+    return ok;
+}
+
+static bool add_rival(sdtree *m, const char *path)
+{
+    rival *more = realloc(m->rivals, (size_t)(m->rival_count + 1) * sizeof *more);
+    if (!more)
+        return false;
+    rival *r = &more[m->rival_count++];
+    m->rivals = more;
+    r->field = load_field(path);
+    r->own = calloc(2 * (size_t)m->tiles, sizeof *r->own);
+    if (!r->field || !r->own)
+        return false;
+    r->other = r->own + m->tiles;
+    r->view = gsd_get_view(r->field);
+    return true;
+}
+
+/* Open what save and compare name. */
+static bool open_rivals(parser *p, sdtree *m)
+{
+    const char *save = option(p->env, "save"), *list = option(p->env, "compare");
+    char path[1024];
+    if (save && p->env->train == 0)
+        complain(p, "save", save, "--train, at whose end it is written");
+    else if (save && !(m->save = fopen(save, "wb")))
+        complain(p, "save", save, "a file that can be written");
+    if (list && p->env->train == 0)
+        complain(p, "compare", list, "--train: a field that learns cannot be compared");
+    while (p->ok && list && *list) {
+        size_t n = strcspn(list, ",");
+        snprintf(path, sizeof path, "%.*s", (int)n, list);
+        if (!add_rival(m, path))
+            complain(p, "compare", path, "a field that save=FILE wrote");
+        list += n + (list[n] == ',');
+    }
+    return p->ok;
+}
+
+static void judge_rivals(sdtree *m, int tile, const tr_vertex *v, const gsd_training_sample *s)
+{
+    const double c = (double)s->pixel_contribution, p = (double)s->pdf_mix;
+    float normal[3], wi[3];
+    memcpy(normal, &v->ns, sizeof normal);
+    memcpy(wi, &v->wi, sizeof wi);
+    for (int i = 0; i < m->rival_count && c > 0 && p > 0; ++i) {
+        rival *r = &m->rivals[i];
+        gsd_handle h =
+            gsd_find(&r->view, s->position, m->product && !(v->flags & TR_VERTEX_PASSES) ? normal : NULL, NULL);
+        double a = (double)h.alpha, q = a * (double)s->pdf_bsdf;
+        q += a < 1 ? (1 - a) * (double)gsd_pdf(&r->view, &h, wi) : 0;
+        r->own[tile] += c * c / (p * p);
+        r->other[tile] += c * c / (p * q);
+    }
+}
+
+/* Second moment under the other field over the own one: of all samples; typical: geometric mean over tiles, weighted by
+   the tile's root, which single bright samples do not decide. */
+static double rival_ratio(const sdtree *m, const rival *r, bool typical)
+{
+    double own = 0, other = 0, sum = 0, weight = 0;
+    for (int i = 0; i < m->tiles; ++i) {
+        own += r->own[i];
+        other += r->other[i];
+        if (r->own[i] > 0) {
+            sum += sqrt(r->own[i]) * log(r->other[i] / r->own[i]);
+            weight += sqrt(r->own[i]);
+        }
+    }
+    return own <= 0 ? 1 : typical ? exp(sum / weight) : other / own;
+}
+
+/* Members "compared" and "compared_typical": a number for each file. */
+static void rivals_json(const sdtree *m, char *out, size_t size)
+{
+    for (int k = 0; k < 2; ++k)
+        for (int i = 0; i < m->rival_count; ++i) {
+            size_t n = strlen(out);
+            snprintf(out + n, size - n, "%s%.6g%s",
+                     i   ? ", "
+                     : k ? ", \"compared_typical\": ["
+                         : ", \"compared\": [",
+                     rival_ratio(m, &m->rivals[i], k == 1), i == m->rival_count - 1 ? "]" : "");
+        }
+}
+
 /* ---- life */
 
 static void sdtree_destroy(void *method)
@@ -85,6 +220,9 @@ static void sdtree_destroy(void *method)
         gsd_stream_destroy(m->streams[i]);
     free(m->streams);
     gsd_destroy(m->field);
+    rivals_free(m);
+    if (m->save)
+        fclose(m->save);
     free(m);
 }
 
@@ -103,7 +241,7 @@ static void *sdtree_create(tr_method_env *env, char *err, size_t err_size)
     m->tiles = env->tiles;
     m->parallel = env->parallel;
     m->parallel_user = env->parallel_user;
-    if (!parse(&p, &desc, m)) {
+    if (!parse(&p, &desc, m) || !open_rivals(&p, m)) {
         sdtree_destroy(m);
         return NULL;
     }
@@ -128,7 +266,8 @@ static bool sdtree_begin_pass(void *method, const tr_pass *pass)
     sdtree *m = method;
     m->pass = pass->index;
     m->fraction = m->sparse ? gsd_record_fraction(m->field) : 1;
-    return !pass->last;
+    m->frozen = pass->last;
+    return !pass->last || m->rival_count > 0;
 }
 
 static bool sdtree_wants_records(void *method, int tile)
@@ -164,7 +303,9 @@ static bool sdtree_record(void *method, int tile, const tr_vertex *vertices, int
         int k = 0;
         for (; k < 64 && done < n; ++k, ++done)
             samples[k] = convert(m, &vertices[done]);
-        ok = !gsd_record(m->streams[tile], samples, (uint32_t)k) && ok;
+        for (int i = 0; m->frozen && i < k; ++i)
+            judge_rivals(m, tile, &vertices[done - k + i], &samples[i]);
+        ok = (m->frozen || !gsd_record(m->streams[tile], samples, (uint32_t)k)) && ok;
     }
     return ok;
 }
@@ -201,7 +342,7 @@ static bool sdtree_end_pass(void *method, const tr_pass *pass)
     info.denoise = m->denoise_last && !pass->freezes ? GSD_DENOISE_OFF : GSD_DENOISE_DEFAULT;
     gsd_result result = gsd_refine(m->field, &info, m->parallel, m->parallel_user);
     m->view = gsd_get_view(m->field);
-    return !result;
+    return !result && (!m->save || !pass->freezes || save_field(m));
 }
 
 /* ---- queries */
@@ -286,6 +427,7 @@ static void sdtree_stats(void *method, tr_method_stats *stats)
              (double)s.mean_blur, m->denoise_seconds, s.open_cells, s.closed_cells, s.unjudged_cells,
              (unsigned long long)s.opened, (unsigned long long)s.closed, (unsigned long long)s.probed,
              (double)s.closed_share, (double)s.mean_alpha, (double)gsd_record_fraction(m->field));
+    rivals_json(m, stats->json, sizeof stats->json);
 }
 
 const tr_method tr_method_sdtree = {.name = "sdtree",
