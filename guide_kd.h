@@ -619,11 +619,12 @@ GKD_QUERY bool gkd_place_handle(gkd_handle *handle, const float pivot[3], const 
     float l = normal ? normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2] : 0;
     bool surface = l > 0.5f && l < 2;
     uint32_t i;
+    l = fabsf(l - 1) > 1e-5f && surface ? 1 / sqrtf(l) : 1; /* draws mirrored by another length would not be unit */
     handle->surface = surface;
     handle->simd = GKD_SIMD_SCALAR; /* find knows better */
     for (i = 0; i < 3; ++i) {
         offset[i] = pivot[i] - position[i];
-        handle->normal[i] = surface ? normal[i] : 0;
+        handle->normal[i] = surface ? normal[i] * l : 0;
     }
     if (!(fabsf(offset[0]) + fabsf(offset[1]) + fabsf(offset[2]) < 1e18f))
         offset[0] = offset[1] = offset[2] = 0;
@@ -1005,7 +1006,8 @@ GKD_QUERY gkd_training_sample gkd_make_sample(const float position[3], const flo
 
 /* The queries for arrays: several in flight at once, by the SIMD level of the view. index lists the entries to process
    in all arrays (NULL = 0 .. count - 1); strides are in bytes. normals, u and alpha (dense floats) of find may be NULL.
-   Handles are dense. Levels differ from the scalar one by <= 1e-5 relative. [any thread] */
+   Handles are dense. Levels differ from the scalar one by <= 1e-5 relative, by 5e-5 at kappa 1e5.
+   [any thread] */
 GKD_API void gkd_find_batch(const gkd_view *view, uint32_t count, const uint32_t *index, const float *positions,
                             size_t position_stride, const float *normals, size_t normal_stride, const float *u,
                             size_t u_stride, gkd_handle *handles, float *alpha);
@@ -1716,15 +1718,13 @@ static int gkdi_compare(const gkdi_split_tests *t, const gkd_signature *cell, co
 /* ---- >>model ------------------------------------------------------------------------------------------------ */
 
 #define GKDI_MAX_KAPPA 1e5
-#ifndef GKDI_STRETCH
-#define GKDI_STRETCH 1.5f /* most by which another position changes a lobe's solid angle; queries use the same */
-#endif
-#define GKDI_CHUNK 64   /* samples of an expectation step */
-#define GKDI_SEEDS 64   /* candidates for first lobes */
-#define GKDI_PAIR 0.05  /* squared distance of samples that may show the same light: 13 degrees */
-#define GKDI_TOP 32     /* largest weights known singly */
-#define GKDI_MIN_TEST 8 /* effective samples that a lobe needs to be split */
-#define GKDI_TESTS 5    /* moments beyond those of a lobe */
+#define GKDI_STRETCH 1.5f /* most by which, in learning, another position changes the solid angle of what is seen */
+#define GKDI_CHUNK 64     /* samples of an expectation step */
+#define GKDI_SEEDS 64     /* candidates for first lobes */
+#define GKDI_PAIR 0.05    /* squared distance of samples that may show the same light: 13 degrees */
+#define GKDI_TOP 32       /* largest weights known singly */
+#define GKDI_MIN_TEST 8   /* effective samples that a lobe needs to be split */
+#define GKDI_TESTS 5      /* moments beyond those of a lobe */
 
 enum { GKDI_BASE, GKDI_AVX2, GKDI_PLAIN }; /* plain: without vector types */
 
@@ -2897,47 +2897,6 @@ static inline void gkdi_model_move(gkdi_model *m, const float pivot[3], const gk
     if (sum > 0)
         gkdi_scale(s, m->count, (double)m->held / sum, 1);
     memcpy(m->pivot, pivot, sizeof m->pivot);
-}
-
-/* Adds b's sums to a's, seen from a's pivot; lobes that are alike become one. Both may have any lobes. */
-static inline void gkdi_model_merge(gkdi_model *a, const gkdi_model *b, const gkdi_fit_options *o)
-{
-    gkdi_model c = *b;
-    gkdi_mixture q;
-    if (!b->count)
-        return;
-    gkdi_model_move(&c, a->pivot, o);
-    if (!a->count) {
-        *a = c;
-        return;
-    }
-    double la = (double)a->level, lb = (double)c.level, ha = (double)a->held, hb = (double)c.held, level, mass, total;
-    gkdi_level(ha, &la, hb, &lb);
-    level = (double)a->samples * la + (double)c.samples * lb;
-    mass = level > 0 ? (double)c.samples * lb / level : 0.5;
-    total = 1 / ((1 - mass) * (1 - mass) / gkdi_max(ha, 1e-30) + mass * mass / gkdi_max(hb, 1e-30));
-    gkdi_scale(&a->sums, a->count, (1 - mass) * total / gkdi_max(ha, 1e-30), 1);
-    gkdi_scale(&c.sums, c.count, mass * total / gkdi_max(hb, 1e-30), 1);
-    a->samples += c.samples;
-    level /= gkdi_max((double)a->samples, 1e-30);
-    for (uint32_t k = 0; k < c.count; ++k) {
-        uint32_t to = !k && o->broad_kappa > 0 ? 0 : a->count;
-        if (to == GKD_MAX_LOBES) { /* into the lobe of nearest mean */
-            float best = -4;
-            for (uint32_t i = 0; i < a->count; ++i) {
-                float dot = (a->sums.x[i] * c.sums.x[k] + a->sums.y[i] * c.sums.y[k] + a->sums.z[i] * c.sums.z[k]) /
-                            (a->sums.soft[i] > 1e-20f ? a->sums.soft[i] : 1e-20f);
-                to = dot > best ? i : to;
-                best = dot > best ? dot : best;
-            }
-        }
-        gkdi_sums_add(&a->sums, to, &c.sums, k, to < a->count);
-        a->count += to == a->count;
-    }
-    gkdi_maximise(&a->sums, a->count, o, &q);
-    a->count = gkdi_merge_all(o, &q, &a->sums, a->count);
-    a->seen = a->seen > UINT32_MAX - b->seen ? UINT32_MAX : a->seen + b->seen;
-    gkdi_total(a, level);
 }
 
 /* Packed form: 8 + 6 * count words of 32 bits. Returns the words written. */
