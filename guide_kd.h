@@ -44,9 +44,9 @@
    HOW IT WORKS
      Space is a kd-tree, cut on the axis along which the positions of non-zero samples vary most, at their mean
      [Ruppert 2020]. Every leaf (*cell*) has a mixture of von Mises-Fisher lobes over directions. A field has a
-   *sampling part*, one flat relocatable block that queries read and only refine (and load) replaces, and a *building
-   part* that accumulate writes. Density of a direction: (1 - e) learned + e/(4 pi), e = 0.01 (desc.uniform); it
-   integrates to 1. Directions are unit, world space, away from the surface towards the light.
+     *sampling part*, one flat relocatable block that queries read and only refine (and load) replaces, and a
+     *building part* that accumulate writes. Density of a direction: (1 - e) learned + e/(4 pi), e = 0.01
+     (desc.uniform); it integrates to 1. Directions are unit, world space, away from the surface towards the light.
 
      When a cell splits (desc.split):
        signature   when it can be told with confidence that the light in a part of it differs from that in the whole
@@ -60,8 +60,9 @@
      is looked at again, so that one update can split many times. Mixtures are inherited, seen from the new pivots.
 
      What is learned: radiance. Each sample counts with its largest channel over pdf_mix. An *update* happens after
-   every desc.update_samples samples and in refine: signatures, splits, and a few steps of weighted EM on each cell's
-     mixture. What queries see changes in refine only.
+     every desc.update_samples samples and in refine: signatures, splits, and a few steps of weighted EM on each
+     cell's mixture. Of all samples of a cell a quarter counts, earlier ones fade: they were drawn with worse guides.
+     What queries see changes in refine only.
 
      Parallax: each lobe knows how far away that is what it shows. gkd_find turns every lobe to the position that asks
      [Ruppert 2020]. With a normal, lobes are multiplied by the cosine, and what lies below the surface is mirrored up:
