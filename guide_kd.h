@@ -93,7 +93,8 @@
    OPTIONS: see gkd_desc. gkd_resolve fills in defaults, gkd_get_desc returns what a field uses.
 
    MEMORY
-     Sampling part: 32 bytes per cell, 24 per lobe, 8 per node of the tree, and 17 KB. Building part: see gkd_stats;
+     Sampling part: 32 bytes per cell, 24 per lobe, 8 per node of the tree, and at most 320 bytes; refine makes a new
+     one beside the old. Building part: see gkd_stats; about 300 bytes and 32 + 24 per lobe for each cell,
      sizeof(gkd_signature) (at most 96) per lookahead cell, of which at most 2^(lookahead + 1) - 2 per cell. max_bytes
      bounds both parts: beyond it cells stop splitting. Samples wait for an update in desc.update_samples * 48 bytes.
      Allocation happens in create, stream_create, record, accumulate, refine, load; never in a query. accumulate and
@@ -132,12 +133,12 @@
 #include <stdint.h>
 #include <string.h>
 
-#define GKD_VERSION 1 /* of the saved format */
+#define GKD_VERSION 2 /* of the saved format */
 
 #ifndef GKD_API /* linkage of the functions; e.g. static */
 #define GKD_API extern
 #endif
-#ifndef GKD_QUERY /* qualifiers of the inline queries; e.g. __device__ static inline: then they call nothing */
+#ifndef GKD_QUERY /* qualifiers of the inline queries; e.g. __device__ static inline: then they are scalar */
 #define GKD_QUERY static inline
 #define GKD_QUERY_SIMD 1
 #endif
@@ -400,8 +401,8 @@ typedef struct gkd_handle {
     gkd_lobe_block block[GKD_MAX_LOBES / 8]; /* (count + 7) / 8 are set */
 } gkd_handle;
 
-/* Find, sample and pdf of one, by the SIMD level: what the inline functions call, unless GKD_QUERY is defined. About
-   twice the time of batches: one waits for its own results. [any thread] */
+/* Find, sample and pdf of one, by the SIMD level: what the inline functions call, unless GKD_QUERY is defined. Two
+   to three times the time of batches: one waits for its own results. [any thread] */
 GKD_API void gkd_find_one(const gkd_view *view, const float position[3], const float *normal, const float *u,
                           gkd_handle *handle);
 GKD_API float gkd_sample_one(const gkd_handle *handle, const float u[2], float direction[3]);
@@ -666,7 +667,7 @@ GKD_QUERY void gkd_orient_lobes(gkd_handle *handle, const gkd_lobe *lobes, uint3
 /* Pdf, sample */
 
 /* Density (1/sr) of a unit direction: (1 - e) p' + e / (4 pi), and e / (4 pi) below the surface. By differences, since
-   kappa (mean . w - 1) cancels. Relative error 1e-5. */
+   kappa (mean . w - 1) cancels. Relative error 1e-5. gkd_pdf of the scalar level. [any thread] */
 GKD_QUERY float gkd_pdf_scalar(const gkd_handle *handle, const float direction[3])
 {
     const float e = handle->uniform, x = direction[0], y = direction[1], z = direction[2];
@@ -767,7 +768,7 @@ GKD_QUERY void gkd_draw_direction(const gkd_draw *in, float direction[3])
 {
     const float *m = in->mean, *n = in->normal;
     float v = gkd_minus_log1m(gkd_clamp(in->r, 0, 0.99999994f) * gkd_one_minus_exp(2 * in->kappa)) / in->kappa;
-    float s, c, radius, sign = copysignf(1, m[2]), a = -1 / (sign + m[2]), b = m[0] * m[1] * a;
+    float s, c, radius, sign = m[2] < 0 ? -1.0f : 1.0f, a = -1 / (sign + m[2]), b = m[0] * m[1] * a;
     uint32_t k;
     v = v < 2 ? v : 2;
     radius = sqrtf(v * (2 - v));
@@ -789,6 +790,7 @@ GKD_QUERY void gkd_draw_direction(const gkd_draw *in, float direction[3])
         direction[k] *= 1.5f - 0.5f * b;
 }
 
+/* gkd_sample of the scalar level. [any thread] */
 GKD_QUERY float gkd_sample_scalar(const gkd_handle *handle, const float u[2], float direction[3])
 {
     gkd_draw draw;
@@ -844,6 +846,7 @@ GKD_QUERY uint32_t gkd_find_box(const gkd_view *view, const float position[3], f
     return link & ~GKD_LEAF;
 }
 
+/* The position moved within the size of its cell. [any thread] */
 GKD_QUERY void gkd_jitter(const gkd_view *view, const float position[3], const float u[3], float out[3])
 {
     float low[3], high[3];
@@ -864,7 +867,7 @@ GKD_QUERY uint32_t gkd_find_cell_near(const gkd_view *view, const float position
     return gkd_find_cell(view, p);
 }
 
-/* What a view knows of a cell, but for the lobes. */
+/* What a view knows of a cell, but for the lobes. [any thread] */
 GKD_QUERY const gkd_cell *gkd_set_cell(const gkd_view *view, uint32_t index, gkd_handle *handle)
 {
     const gkd_cell *cell = &view->cells[index];
@@ -875,6 +878,7 @@ GKD_QUERY const gkd_cell *gkd_set_cell(const gkd_view *view, uint32_t index, gkd
     return cell;
 }
 
+/* gkd_find of the scalar level. [any thread] */
 GKD_QUERY void gkd_find_scalar(const gkd_view *view, const float position[3], const float *normal, const float *u,
                                gkd_handle *handle)
 {
@@ -1007,7 +1011,7 @@ GKD_QUERY gkd_training_sample gkd_make_sample(const float position[3], const flo
 
 /* The queries for arrays: several in flight at once, by the SIMD level of the view. index lists the entries to process
    in all arrays (NULL = 0 .. count - 1); strides are in bytes. normals, u and alpha (dense floats) of find may be NULL.
-   Handles are dense. Levels differ from the scalar one by <= 1e-5 relative, by 5e-5 at kappa 1e5.
+   Handles are dense. Densities differ between levels by <= 1e-5 relative, by 5e-5 at kappa 1e5.
    [any thread] */
 GKD_API void gkd_find_batch(const gkd_view *view, uint32_t count, const uint32_t *index, const float *positions,
                             size_t position_stride, const float *normals, size_t normal_stride, const float *u,
@@ -1222,7 +1226,8 @@ static void gkdi_shape_add(gkdi_shape *s, const float direction[3], float value)
     s->s[5] += y * z;
 }
 
-/* Many non-zero samples, in registers; positions count as if they had come one by one. */
+/* Many non-zero samples, in registers; positions count as if they had come one by one, but
+   for the window of their variance. */
 static void gkdi_signature_add_all(gkd_signature *s, gkdi_shape *shape, const gkdi_item *items, uint32_t count)
 {
     gkd_signature t = *s;
@@ -1731,8 +1736,8 @@ enum { GKDI_BASE, GKDI_AVX2, GKDI_PLAIN }; /* plain: without vector types */
 
 /* Sums of a mixture, in effective samples. Lobes are columns. */
 typedef struct gkdi_sums {
-    float soft[GKD_MAX_LOBES];                                  /* sum of v = weight * responsibility */
-    float squares[GKD_MAX_LOBES];                               /* sum of v^2 */
+    float soft[GKD_MAX_LOBES];    /* sum of v = weight * responsibility */
+    float squares[GKD_MAX_LOBES]; /* sum of v^2; soft^2 / squares is the lobe's own number of samples, and fades */
     float x[GKD_MAX_LOBES], y[GKD_MAX_LOBES], z[GKD_MAX_LOBES]; /* sum of v * direction from the pivot */
     float nearness[GKD_MAX_LOBES];                              /* sum of v * nearness from the pivot */
 } gkdi_sums;
@@ -1747,14 +1752,14 @@ typedef struct gkdi_model {
     gkdi_sums sums;
 } gkdi_model;
 
-/* Defaults are tuned on SF1: single points, cells of 0.1 and 0.3 with 128 .. 131072 samples, and kd-trees of 2^14 ..
-   2^20 samples; all are flat around the chosen value but where said. */
+/* Defaults are tuned on SF1, where all are flat around the chosen value, but for history, kappa_prior, merge and share:
+   those come from renders. */
 typedef struct gkdi_fit_options {
     uint32_t simd;         /* GKDI_BASE ...; the same bits from all */
     uint32_t most;         /* lobes of a mixture, 1 .. GKD_MAX_LOBES */
-    uint32_t lobes;        /* first lobes at most; 8 .. 16 differ by 4 % */
+    uint32_t lobes;        /* first lobes at most */
     uint32_t seed_seen;    /* while a model has seen fewer samples, a batch may bring more first lobes */
-    uint32_t first_passes; /* over a subset, for a new model; 10 is worse by 2 % where samples are few */
+    uint32_t first_passes; /* over a subset, for a new model */
     uint32_t passes;       /* over all samples; 1: no splits */
     uint32_t subset;       /* samples of first passes */
     float history;         /* of all samples seen so many count: those held before a batch fade to it */
@@ -1763,15 +1768,15 @@ typedef struct gkdi_fit_options {
     float kappa_spread;    /* with that 1 - mean cosine: 0.03 for many samples, 0.1 for few */
     float broad_kappa;     /* lobe 0 stays at most so concentrated; 0: no such lobe */
     float broad_prior;     /* samples added to its weight */
-    float broad_share;     /* and it weighs at least this: 0 is worse by 2 % where samples are few */
+    float broad_share;     /* and it weighs at least this */
     float split;           /* chi-square of a lobe's moments, times its weight, above which it is split, */
     float split_price;     /* raised by that over the samples of the batch */
     float split_lobe;      /* and least chi-square of the lobe alone, */
-    float split_sigma;     /* with that many standard errors: 2 is worse by 3 % for batches of 100 */
+    float split_sigma;     /* with that many standard errors */
     float merge;           /* Pearson chi-square of two lobes against one, times their weight, below which they merge */
     float share;           /* a sample weighs at most share / sqrt(n) of its batch */
     float parallax;        /* nearness is at most this over the root mean square distance of samples to the pivot */
-    bool jacobian;         /* solid angles change with the position, see gkdi_load; queries must do likewise */
+    bool jacobian;         /* solid angles change with the position, see gkdi_load */
     double *likelihood;    /* NULL, or `passes` values: mean log density before each pass (slow) */
 } gkdi_fit_options;
 
@@ -2250,7 +2255,7 @@ static inline void gkdi_maximise(const gkdi_sums *s, uint32_t count, const gkdi_
             mean[1] = (float)(y / r);
             mean[2] = (float)(z / r);
         }
-        double own = w > 0 ? b * (double)s->squares[k] / w : b;
+        double own = w > 0 && s->squares[k] > 0 ? b * (double)s->squares[k] / w : b; /* squares may have underflowed */
         spread = (gkdi_max(w - r, 0) + own * (double)o->kappa_spread) / (w + own);
         kappa = gkdi_kappa(spread);
         weight = broad ? (w + (double)o->broad_prior) / sum : (w + a) / sum * factor;
@@ -2810,6 +2815,7 @@ static inline void gkdi_model_fit(gkdi_model *m, const gkdi_item *items, uint32_
     if (held > 0)
         gkdi_level(held, &old, w.effective, &now);
     samples = held > 0 ? samples : 0;
+    m->count = held > 0 ? m->count : 0;
     level = (samples * old + n * now) / (samples + n);
     mass = n * now / (samples * old + n * now);
     total = held > 0 ? 1 / ((1 - mass) * (1 - mass) / held + mass * mass / w.effective) : w.effective;
@@ -2825,7 +2831,7 @@ static inline void gkdi_model_fit(gkdi_model *m, const gkdi_item *items, uint32_
     if (m->count) {
         for (uint32_t k = 0; k < m->count; ++k) /* lobes to come have none */
             gkdi_sums_add(&history, k, &m->sums, k, false);
-        gkdi_scale(&history, m->count, held > 0 ? (1 - mass) * total / (double)m->held : 0, held > 0 ? keep : 1);
+        gkdi_scale(&history, m->count, (1 - mass) * total / (double)m->held, keep);
         gkdi_maximise(&history, m->count, o, &q);
         if (m->seen < o->seed_seen)
             gkdi_seed(items, n, &view, o, &q);
@@ -2863,7 +2869,7 @@ static inline void gkdi_model_decay(gkdi_model *m, float factor)
     gkdi_scale(&m->sums, m->count, (double)factor, (double)factor);
     m->held *= factor;
     m->samples *= factor;
-    m->seen = (uint32_t)((double)m->seen * (double)factor);
+    m->seen = (uint32_t)ceil((double)m->seen * (double)factor);
 }
 
 /* The same light seen from another pivot: means turn, and a lobe at finite distance becomes sharper and weaker with
@@ -5120,7 +5126,7 @@ GKDI_WIDE static void gkdi_orient_wide(uint32_t count, const gkdi_view_from *fro
         sum[part[k].of] += gkdi_v_sum(gkdi_v_load(part[k].block->upper));
     }
     for (i = 0; i < count; ++i)
-        inverse[i] = 1 / sum[i];
+        inverse[i] = sum[i] > GKD_DIM ? 1 / sum[i] : 0;
     for (k = 0; k < n; ++k)
         gkdi_finish_lobes(part[k].block, part[k].left, inverse[part[k].of], &before[part[k].of]);
     for (i = 0; i < count; ++i)
@@ -5708,7 +5714,7 @@ static bool gkdi_model_valid(const uint32_t *packed, uint32_t words)
     for (k = 0; ok && k < count; ++k) {
         double x = (double)m.sums.x[k], y = (double)m.sums.y[k], z = (double)m.sums.z[k], w = (double)m.sums.soft[k];
         ok = w >= 0 && w < INFINITY && x * x + y * y + z * z <= 1.001 * w * w + 1e-30 && m.sums.nearness[k] >= 0 &&
-             m.sums.nearness[k] < INFINITY;
+             m.sums.nearness[k] < INFINITY && m.sums.squares[k] >= 0 && m.sums.squares[k] < 1e30f;
     }
     return ok;
 }

@@ -146,10 +146,6 @@ static bool open_rivals(parser *p, sdtree *m)
 {
     const char *save = option(p->env, "save"), *list = option(p->env, "compare");
     char path[1024];
-    if (save && p->env->train == 0)
-        complain(p, "save", save, "--train, at whose end it is written");
-    else if (save && !(m->save = fopen(save, "wb")))
-        complain(p, "save", save, "a file that can be written");
     if (list && p->env->train == 0)
         complain(p, "compare", list, "--train: a field that learns cannot be compared");
     while (p->ok && list && *list) {
@@ -159,6 +155,10 @@ static bool open_rivals(parser *p, sdtree *m)
             complain(p, "compare", path, "a field that save=FILE wrote");
         list += n + (list[n] == ',');
     }
+    if (save && p->env->train == 0)
+        complain(p, "save", save, "--train, at whose end it is written");
+    else if (save && p->ok && !(m->save = fopen(save, "wb")))
+        complain(p, "save", save, "a file that can be written");
     return p->ok;
 }
 
@@ -172,7 +172,7 @@ static void judge_rivals(sdtree *m, int tile, const tr_vertex *v, const gsd_trai
         rival *r = &m->rivals[i];
         gsd_handle h =
             gsd_find(&r->view, s->position, m->product && !(v->flags & TR_VERTEX_PASSES) ? normal : NULL, NULL);
-        double a = (double)h.alpha, q = a * (double)s->pdf_bsdf;
+        double a = (double)h.alpha, q = a * fmax((double)s->pdf_bsdf, 1e-4 * p);
         q += a < 1 ? (1 - a) * (double)gsd_pdf(&r->view, &h, wi) : 0;
         r->own[tile] += c * c / (p * p);
         r->other[tile] += c * c / (p * q);
@@ -265,7 +265,7 @@ static bool sdtree_begin_pass(void *method, const tr_pass *pass)
 {
     sdtree *m = method;
     m->pass = pass->index;
-    m->fraction = m->sparse ? gsd_record_fraction(m->field) : 1;
+    m->fraction = m->sparse && !pass->last ? gsd_record_fraction(m->field) : 1;
     m->frozen = pass->last;
     return !pass->last || m->rival_count > 0;
 }
