@@ -1176,7 +1176,7 @@ static void test_forged_saves_never_harm(void **state)
     static gkd_training_sample s[300];
     seed(72);
     make_samples(NULL, s, 300);
-    for (int i = 0; i < 4000; ++i) {
+    for (int i = 0; i < 1500; ++i) {
         gkd_field *g;
         gkdi_header h;
         counter c = {0};
@@ -1363,7 +1363,7 @@ static void test_every_failed_allocation_is_survived(void **state)
     long requests = c.requests;
     assert_true(requests > 40);
     for (int all = 0; all < 2; ++all)
-        for (long k = 1; k <= requests; k += requests > 600 ? 1 + (k > 60) * requests / 300 : 1) {
+        for (long k = 1; k <= requests; k += requests > 300 ? 1 + (k > 60) * requests / 120 : 1) {
             c = (counter){.fail_at = k, .fail_all = all};
             scenario(&c);
             assert_int_equal(c.live, 0);
