@@ -306,8 +306,9 @@ typedef struct gsd_training_sample {
 typedef struct gsd_pass {
     bool pixel_estimate;      /* the pass's pixel_contributions were relative to a pixel estimate: see Gate */
     gsd_denoise_mode denoise; /* of this refine, in place of desc.denoise */
-    /* Told as each step of refine begins, by the thread that called it: "measure", "denoise", "split", "build", and
-       NULL when all is done (not after a failure). For measuring where the time goes; NULL = nobody is told. */
+    /* Told as each step of refine begins, by the thread that called it: "measure", "denoise" (unless it is off),
+       "split", "build", and NULL when all is done (not after a failure). For measuring where the time goes; NULL =
+       nobody is told. */
     void (*on_step)(void *user, const char *step);
     void *on_step_user;
 } gsd_pass;
@@ -4113,7 +4114,8 @@ static uint32_t gsdi_refine_plan(gsdi_refinement *r, gsd_parallel_fn parallel, v
         r->stats.waiting_cells += !r->jobs[i].rebuild && s->fresh > 0;
         r->stats.unread_cells += !(s->fresh > 0);
     }
-    gsdi_step(r, "denoise");
+    if (r->denoise != GSD_DENOISE_OFF)
+        gsdi_step(r, "denoise");
     if ((r->denoise == GSD_DENOISE_BLUR && !gsdi_denoise(r, parallel, user)) ||
         (r->denoise == GSD_DENOISE_GAUSSIAN && !gsdi_gauss_denoise(r, parallel, user)))
         return 0;

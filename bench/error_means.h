@@ -38,13 +38,21 @@ static inline estimate geometric(const double *values, int n)
 {
     estimate e = {(double)NAN, (double)NAN, (double)NAN, 0};
     double sum = 0, squares = 0;
-    for (int i = 0; i < n; ++i)
+    int zeros = 0;
+    for (int i = 0; i < n; ++i) {
+        zeros += values[i] == 0;
         if (isfinite(values[i]) && values[i] > 0) {
             double l = log(values[i]);
             sum += l;
             squares += l * l;
             e.count++;
         }
+    }
+    if (!e.count && zeros) { /* all that there is: 0, not nothing to tell */
+        e.value = 0;
+        e.count = zeros;
+        return e;
+    }
     if (!e.count)
         return e;
     double mean = sum / e.count;
@@ -74,8 +82,9 @@ static inline double value_relmse(const row *r) { return r->relmse; }
 static inline double value_mrae(const row *r) { return r->mrae; }
 static inline double value_spp(const row *r) { return r->spp; }
 static inline double value_seconds(const row *r) { return r->cpu_seconds; }
-static inline double value_train_spp(const row *r) { return r->train_spp; }
-static inline double value_train_seconds(const row *r) { return r->train_seconds; }
+static inline double if_learned(double v) { return v > 0 ? v : (double)NAN; }
+static inline double value_train_spp(const row *r) { return if_learned(r->train_spp); }
+static inline double value_train_seconds(const row *r) { return if_learned(r->train_seconds); }
 static inline double value_denoise(const row *r) { return 100 * r->denoise_seconds / r->train_seconds; }
 static inline double value_speed(const row *r) { return r->spp / r->cpu_seconds; }
 static inline double value_efficiency(const row *r) { return 1 / (r->relmse * r->cpu_seconds); }

@@ -15,6 +15,7 @@
 #define GSD_IMPLEMENTATION
 #include "guide_sdtree.h"
 
+#include "chi_square.h"
 #include "counter.h"
 #include "crowd.h"
 #include "rng.h"
@@ -314,12 +315,6 @@ static void test_pdf_integrates_to_one(void **state)
             assert_true(depths[i] > 9 || fabs(quadrature - 1) < 1e-5);
             gsd_destroy(f);
         }
-}
-
-/* Upper tail of chi-square as a normal deviate (Wilson and Hilferty). */
-static double chi_square_deviate(double chi2, double df)
-{
-    return (cbrt(chi2 / df) - (1 - 2 / (9 * df))) / sqrt(2 / (9 * df));
 }
 
 /* Chi-square of counts and its degrees of freedom; slots that expect fewer than 20 are counted as one. What expects
@@ -2400,6 +2395,7 @@ static void test_gate_does_not_close_even_cells_at_once(void **state)
         gsd_stats s = gate_after(false, 1, passes, &f);
         assert_int_equal(s.closed_cells, passes > 8 ? s.cells : 0);
         assert_int_equal(gsd_all_closed(f), passes > 8);
+        assert_true((s.closed_share == 1) == (passes > 8));
         gsd_destroy(f);
     }
 }
