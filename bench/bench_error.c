@@ -9,6 +9,7 @@
    else the machine does meets all of them. Every row is written when it is known; a second call with the same settings
    goes on where the first one stopped. A render that crashes or hangs marks its row, and the rest goes on. */
 #define _DEFAULT_SOURCE
+#define PROGRAM "bench_error"
 #include "error_report.h"
 #include "options.h"
 
@@ -47,12 +48,6 @@ typedef struct options {
 } options;
 
 /* ---- >>options ---------------------------------------------------------------------------------------------- */
-
-static int die(const char *what, const char *value)
-{
-    fprintf(stderr, "bench_error: %s%s%s\n", what, value ? ": " : "", value ? value : "");
-    return 1;
-}
 
 static bool split(const char *text, names *out)
 {
@@ -507,16 +502,6 @@ static bool run_tasks(const options *o, const rows *tasks, rows *all, FILE *csv)
 }
 
 /* ---- >>report ----------------------------------------------------------------------------------------------- */
-
-static FILE *open_in(const char *folder, const char *name)
-{
-    char path[1024];
-    snprintf(path, sizeof path, "%s/%s", folder, name);
-    FILE *f = fopen(path, "w");
-    if (!f)
-        die("cannot be written", path);
-    return f;
-}
 
 static int report(const options *o, plan *p, const rows *all)
 {

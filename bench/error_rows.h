@@ -9,6 +9,24 @@
 #include <stdlib.h>
 #include <string.h>
 
+/* Says what is wrong, in the name of PROGRAM, which whoever includes this has defined. Returns the exit status. */
+static inline int die(const char *what, const char *value)
+{
+    fprintf(stderr, PROGRAM ": %s%s%s\n", what, value ? ": " : "", value ? value : "");
+    return 1;
+}
+
+/* A file to write; NULL, and said, where that fails. */
+static inline FILE *open_in(const char *folder, const char *name)
+{
+    char path[1024];
+    snprintf(path, sizeof path, "%s/%s", folder, name);
+    FILE *f = fopen(path, "w");
+    if (!f)
+        die("cannot be written", path);
+    return f;
+}
+
 /* Numbers of a row, by the names that the renderer's JSON and the CSV use. Missing ones are NaN. */
 #define ROW_NUMBERS(X)                                                                                                 \
     X(spp)                                                                                                             \

@@ -10,6 +10,7 @@
    Every picture is rendered after a training with a frozen field; the training's own pictures are thrown away. */
 #define _DEFAULT_SOURCE
 #include "bench.h"
+#define PROGRAM "study_kd"
 #include "error_means.h"
 #include "options.h"
 #include "plot.h"
@@ -136,12 +137,6 @@ typedef struct options {
     const char *only, *out, *jobs, *program;
     bool report;
 } options;
-
-static int die(const char *what, const char *value)
-{
-    fprintf(stderr, "study_kd: %s%s%s\n", what, value ? ": " : "", value ? value : "");
-    return 1;
-}
 
 /* Is the word in the list a,b,c? */
 static bool listed(const char *list, const char *word)
@@ -751,16 +746,6 @@ static int parse(options *o, int argc, char **argv)
     for (int i = 0; scenes && i < STUDIES; ++i)
         o->preset.scenes[i] = scenes;
     return 0;
-}
-
-static FILE *open_in(const char *folder, const char *name)
-{
-    char path[1024];
-    snprintf(path, sizeof path, "%s/%s", folder, name);
-    FILE *f = fopen(path, "w");
-    if (!f)
-        die("cannot be written", path);
-    return f;
 }
 
 /* A study: render what is missing, then write its tables. */

@@ -16,16 +16,13 @@
 #define GSD_IMPLEMENTATION
 #include "guide_sdtree.h"
 
+#include "chi_square.h"
 #include "counter.h"
 #include "crowd.h"
+#include "kd_field.h"
 #include "rng.h"
 
-#define PI 3.14159265358979323846
-#define UNIFORM (1 / (4 * PI))
-
 /* ---- helpers */
-
-#define OK(call) assert_int_equal((call), GKD_OK)
 
 static void random_direction(float d[3])
 {
@@ -33,14 +30,6 @@ static void random_direction(float d[3])
     d[0] = (float)(r * cos(phi));
     d[1] = (float)(r * sin(phi));
     d[2] = (float)z;
-}
-
-static gkd_desc unit_cube(void)
-{
-    gkd_desc d;
-    memset(&d, 0, sizeof d);
-    d.bounds_max[0] = d.bounds_max[1] = d.bounds_max[2] = 1;
-    return d;
 }
 
 static void count_with(gkd_desc *d, counter *c)
@@ -109,15 +98,6 @@ static void make_samples(const gkd_view *v, gkd_training_sample *s, uint32_t n)
         L = i % 7 ? L : 0;
         s[i] = gkd_make_scalar_sample(p, d, NULL, distance, L, L * 0.3f, L * 0.3f * (0.5f + p[0]), mix, pb, pg);
     }
-}
-
-static void learn(gkd_field *f, const gkd_training_sample *s, uint32_t n)
-{
-    gkd_stream *stream;
-    OK(gkd_stream_create(f, &stream));
-    OK(gkd_record(stream, s, n));
-    OK(gkd_accumulate(f, &stream, 1, NULL, NULL));
-    gkd_stream_destroy(stream);
 }
 
 /* Passes of `first`, twice `first`, ... samples. */
@@ -429,12 +409,6 @@ static void test_an_untrained_field_is_uniform(void **state)
     gkd_find(&v, p, NULL, NULL, &h);
     assert_true(fabs((double)gkd_pdf(&h, w) / UNIFORM - 1) < 1e-5);
     gkd_destroy(f);
-}
-
-/* Upper tail of chi-square as a normal deviate (Wilson and Hilferty). */
-static double chi_square_deviate(double chi2, double df)
-{
-    return (cbrt(chi2 / df) - (1 - 2 / (9 * df))) / sqrt(2 / (9 * df));
 }
 
 /* Bins of equal area, each integrated by many points; samples of the handle must fill them as its density says. */

@@ -12,14 +12,12 @@
 #define GKD_IMPLEMENTATION
 #include "guide_kd.h"
 
+#include "chi_square.h"
+#include "kd_field.h"
 #include "rng.h"
-
-#define PI 3.14159265358979323846
-#define UNIFORM (1 / (4 * PI))
 
 /* ---- helpers */
 
-#define OK(call) assert_int_equal((call), GKD_OK)
 /* x < limit; says both where not, NaN too. */
 #define BELOW(x, limit) below((x), (limit), #x, __LINE__)
 
@@ -352,9 +350,6 @@ static void test_what_lies_below_the_horizon_is_mirrored_up(void **state)
 
 /* ---- draws */
 
-/* Upper tail of chi-square as a normal deviate (Wilson and Hilferty). */
-static double deviate(double chi2, double df) { return (cbrt(chi2 / df) - (1 - 2 / (9 * df))) / sqrt(2 / (9 * df)); }
-
 enum { TURNS = 5, RINGS = 8, BINS = GKD_MAX_LOBES * TURNS * RINGS };
 
 /* Bins that follow the lobes: the lobe that gives most there, its rings of equal share, and sectors. */
@@ -412,7 +407,7 @@ static void check_draws(const gkd_handle *h, uint32_t n)
         df++;
     }
     assert_true(df > 4);
-    BELOW(deviate(chi2, df), 5);
+    BELOW(chi_square_deviate(chi2, df), 5);
 }
 
 static void test_draws_follow_the_density(void **state)
@@ -1060,21 +1055,9 @@ static void test_a_lobe_over_two_lights_splits(void **state)
     assert_true(kl[0] > 3 * kl[1]);
 }
 
-static gkd_desc unit_cube(void)
+static void learn_pass(gkd_field *f, const gkd_training_sample *s, uint32_t n)
 {
-    gkd_desc d;
-    memset(&d, 0, sizeof d);
-    d.bounds_max[0] = d.bounds_max[1] = d.bounds_max[2] = 1;
-    return d;
-}
-
-static void learn(gkd_field *f, const gkd_training_sample *s, uint32_t n)
-{
-    gkd_stream *stream;
-    OK(gkd_stream_create(f, &stream));
-    OK(gkd_record(stream, s, n));
-    OK(gkd_accumulate(f, &stream, 1, NULL, NULL));
-    gkd_stream_destroy(stream);
+    learn(f, s, n);
     OK(gkd_refine(f, NULL, NULL, NULL));
     OK(gkd_validate(f));
 }
@@ -1104,7 +1087,7 @@ static void test_mixtures_keep_to_max_lobes(void **state)
                 floats(w, c);
                 s[j] = gkd_make_scalar_sample(p, c, NULL, INFINITY, 1, 1, 1, 1, (float)UNIFORM, 0);
             }
-            learn(f, s, N);
+            learn_pass(f, s, N);
         }
         gkd_view v = gkd_get_view(f);
         for (uint32_t c = 0; c < v.cell_count; ++c)
@@ -1264,7 +1247,7 @@ static void test_a_single_sample_is_learned(void **state)
         seed(16);
         OK(gkd_create(&d, &f));
         for (int pass = 0; pass < 5; ++pass) {
-            learn(f, &s, 1);
+            learn_pass(f, &s, 1);
             gkd_view v = gkd_get_view(f);
             gkd_find(&v, p, NULL, NULL, &h);
             BELOW(fabs(integral(&h) - 1), 2e-5);
@@ -1345,7 +1328,7 @@ static void test_place_and_size_of_the_scene_do_not_matter(void **state)
         seed(17);
         for (int pass = 0; pass < 4; ++pass) {
             lamp_samples(s, N, lows[i], sizes[i], false);
-            learn(f, s, N);
+            learn_pass(f, s, N);
         }
         gain[i] = lamp_gain(f, lows[i], sizes[i]);
         assert_true(gain[i] > 3);
@@ -1369,7 +1352,7 @@ static void test_an_outlier_does_not_take_all(void **state)
         seed(18);
         for (int pass = 0; pass < 4; ++pass) {
             lamp_samples(s, N, 0, 1, outlier && pass == 1);
-            learn(f, s, N);
+            learn_pass(f, s, N);
         }
         gain[outlier] = lamp_gain(f, 0, 1);
         gkd_destroy(f);
