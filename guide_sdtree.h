@@ -23,7 +23,7 @@
                    float u[2] = {(float)(rand() & 0xffff) / 65536.0f, (float)(rand() & 0xffff) / 65536.0f};
                    gsd_handle handle = gsd_find(&view, p, NULL, NULL);
                    float pdf = gsd_sample(&view, &handle, u, d), L = d[0] > 0.95f ? 100.0f : 1.0f;
-                   gsd_training_sample sample = gsd_make_scalar_sample(p, d, NULL, L, L, L, pdf, pdf, 0);
+                   gsd_training_sample sample = gsd_make_scalar_sample(p, d, NULL, 3, L, L, L, pdf, pdf, 0);
                    gsd_record(stream, &sample, 1);
                }
                gsd_accumulate(field, &stream, 1, NULL, NULL);
@@ -55,6 +55,14 @@
      c_k(n) (gsd_bin_cosine), constant in each of 8 x 8 bins k of (phi, z), and divided by its mean: exact, since pdf
      and sample speak of the same c_k. One cell can then serve both sides of a thin wall, and nothing is spent below
      the horizon. Quadtrees learn incident light without the cosine: give the same normal to gsd_make_sample.
+
+     Parallax: what is near is seen in another direction from each place of a cell. A cell's quadtree lies on a sphere
+     around its pivot, on which directions from any place within are mapped to those from the pivot and back, exactly
+     (gsd_to_pivot). Its nearness, 1 / radius, is the mean of the samples' 1 / distance, weighted by what goes into the
+     quadtree: bright light, for which it matters, decides. A quadtree of few far lights so stays sharp in a large cell
+     [in place of the distance of every lobe, Ruppert 2020]. The pivot is the middle of the cell; parts of it keep it
+     while all of them lie within 0.6 radii of it and nearness has not changed by a factor of two, since sums are seen
+     from there. The even share is even as seen from the place. Distances of INFINITY: no parallax.
 
      What is learned (desc.target); p = pdf_mix, the density the direction was drawn with:
        radiance        mass of a leaf = sum of L / p                                              [Mueller 2017]
@@ -105,16 +113,16 @@
    THE SAMPLE
      One per non-delta path vertex whose direction was traced. radiance L: from that direction, no cosine, no BSDF, not
      divided by a pdf; light that next-event estimation can sample weighted by its MIS weight; connections of this
-     vertex not included. Zeros count: record them. gsd_make_sample fills one from RGB arrays; the normal is the one
-     that gsd_find got. A direction rejected before tracing (f = 0) has radiance GSD_REJECTED (-0.0f): it counts as a
-     visit and as a zero for the second-moment targets and the gate. pdf_guide = 0 means "not evaluated"; the field
-     evaluates it where it needs it. A vertex that was recorded counts as a read of its cell; cells without new
-     samples are left alone by refine.
+     vertex not included. Zeros count: record them. distance: to the next vertex, INFINITY = the environment or not
+     known. gsd_make_sample fills one from RGB arrays; the normal is the one that gsd_find got. A direction rejected
+   before tracing (f = 0) has radiance GSD_REJECTED (-0.0f): it counts as a visit and as a zero for the second-moment
+   targets and the gate. pdf_guide = 0 means "not evaluated"; the field evaluates it where it needs it. A vertex that
+   was recorded counts as a read of its cell; cells without new samples are left alone by refine.
 
    OPTIONS: see gsd_desc. gsd_resolve fills in defaults, gsd_get_desc returns what a field uses.
 
    MEMORY
-     Sampling part: 16 bytes per quadtree node, 40 per cell, 32 per quadtree, 512 per learned quadtree (bins of
+     Sampling part: 16 bytes per quadtree node, 56 per cell, 32 per quadtree, 512 per learned quadtree (bins of
      directions: skip three levels, carry the cosine), 12 per leaf with desc.alias, 4 per spatial node, and 16 KB.
      Building part: 20 bytes per quadtree node, sizeof(gsd_cell_state) (below 600) per cell.
      max_bytes bounds the peak of both parts while refine runs, old and new together: trees coarsen and cells stop
@@ -122,7 +130,7 @@
      imported trees.) Denoising takes of it 24 bytes per node of the old building part, which are gone before the new
      part is made; GSD_DENOISE_GAUSSIAN up to a quarter instead, 10 MB for a tree of depth 10, four times that for each
      level more and for up to 32 trees at once, and up to an eighth for the trees it makes, 28 bytes per node, which
-     stay until the new part stands. Streams (44 bytes per sample) and the scratch of accumulate (at most 13 MB and 8
+     stay until the new part stands. Streams (48 bytes per sample) and the scratch of accumulate (at most 13 MB and 8
      bytes per cell, kept for the next call) come on top. Allocation happens in create, stream_create, record,
      accumulate, refine, import, load, gsd_forest_split; never in a query. Stack: below 16 KB per call.
 
@@ -136,10 +144,10 @@
 
    ERRORS
      gsd_result, 0 = ok; gsd_result_string says which field to change. Asserts (GSD_ASSERT) catch programming errors.
-     Bad samples (NaN, infinity, negative, >= 1e30, pdf_mix <= 0, zero direction) are refused and counted in gsd_stats;
-     positions outside the bounds are clamped and counted. A failed allocation leaves the field as it was before the
-     call, except that accumulate has lost the samples it was given (counted).
-     gsd_load checks size, version, byte order, checksum and every index before use.
+     Bad samples (NaN, infinity, negative, >= 1e30, pdf_mix <= 0, zero direction, distance <= 0 or NaN) are refused and
+     counted in gsd_stats; positions outside the bounds are clamped and counted. A failed allocation leaves the field as
+   it was before the call, except that accumulate has lost the samples it was given (counted). gsd_load checks size,
+   version, byte order, checksum and every index before use.
 
    NUMERICAL LIMITS
      Quadtree depth <= 20 (default 16). Directions are quantised to 24 bits an axis; u is read to 24 bits and 8 more are
@@ -154,6 +162,7 @@
      T. Mueller, M. Gross, J. Novak 2017, Practical Path Guiding for Efficient Light-Transport Simulation.
      T. Mueller 2019, "Practical Path Guiding" in Production, ch. 10 of SIGGRAPH course Path Guiding in Production.
      J. Vorba, J. Krivanek 2016, Adjoint-Driven Russian Roulette and Splitting in Light Transport Simulation.
+     L. Ruppert, S. Herholz, H. Lensch 2020, Robust Fitting of Parallax-Aware Mixtures for Path Guiding.
      A. Rath, P. Grittmann, S. Herholz, P. Vevoda, P. Slusallek, J. Krivanek 2020, Variance-Aware Path Guiding.
      J. Nilsson, thesis on denoising the quadtrees of path guiding, Chalmers University of Technology.
      A. Walker 1977, An Efficient Method for Generating Discrete Random Variables with General Distributions (alias).
@@ -169,7 +178,7 @@
 #include <stdint.h>
 #include <string.h>
 
-#define GSD_VERSION 4 /* of the saved format */
+#define GSD_VERSION 5 /* of the saved format */
 
 #ifndef GSD_API /* linkage of the functions; e.g. static */
 #define GSD_API extern
@@ -287,11 +296,12 @@ typedef struct gsd_desc {
     void *user;
 } gsd_desc;
 
-/* What is learned from one path vertex. 44 bytes. See THE SAMPLE; pdfs in 1/sr, L in W/m^2/sr. Filled by
+/* What is learned from one path vertex. 48 bytes. See THE SAMPLE; pdfs in 1/sr, L in W/m^2/sr. Filled by
    gsd_make_sample. */
 typedef struct gsd_training_sample {
     float position[3];
     uint32_t direction[2];    /* with the normal; see gsd_pack_direction */
+    float nearness;           /* 1 / distance to the next vertex; 0 = infinitely far */
     float radiance;           /* mean over channels of L; GSD_REJECTED */
     float contribution;       /* mean over channels of f L cos */
     float pixel_contribution; /* mean over channels of f L cos * throughput before this vertex / pixel estimate; not
@@ -386,7 +396,7 @@ typedef struct gsd_alias {
     uint32_t node, other;
 } gsd_alias;
 
-/* 40 bytes: what a query knows about a cell. */
+/* 56 bytes: what a query knows about a cell. */
 typedef struct gsd_cell {
     uint32_t root;        /* node of its quadtree; 0 = uniform */
     uint32_t jump;        /* into the table of jumps; 0 = none */
@@ -398,6 +408,8 @@ typedef struct gsd_cell {
     uint32_t gate;   /* GSD_GATE_... */
     float reflected; /* see gsd_handle */
     uint32_t depth;  /* of the deepest leaf of its quadtree */
+    float pivot[3];  /* where its quadtree is seen from */
+    float nearness;  /* 1 / radius of the sphere around it on which the quadtree lies; 0 = infinitely large */
 } gsd_cell;
 enum { GSD_GATE_UNJUDGED, GSD_GATE_OPEN, GSD_GATE_CLOSED };
 
@@ -418,14 +430,15 @@ typedef struct gsd_view {
 } gsd_view;
 #define GSD_CELL_BIT 0x80000000u
 
-/* What find gives: plain data, 44 bytes, valid as long as the view. */
+/* What find gives: plain data, 56 bytes, valid as long as the view. */
 typedef struct gsd_handle {
     uint32_t cell, root, jump, alias, alias_count;
     float alpha;     /* probability of BSDF sampling; 1 = do not guide */
     float reflected; /* mean of contribution / pdf_mix in the cell: the radiance that its surfaces reflect, W/m^2/sr; 0
                         = not known. What a path can still bring here, for Russian roulette [Vorba 2016] */
     float normal[3];
-    float product; /* > 0: the density is multiplied by the cosine to this normal; 1 / (mean cosine) */
+    float product;   /* > 0: the density is multiplied by the cosine to this normal; 1 / (mean cosine) */
+    float offset[3]; /* position relative to the pivot of the cell, in radii of its sphere; shorter than 1 */
 } gsd_handle;
 
 /* ---- >>field ------------------------------------------------------------------------------------------------ */
@@ -600,7 +613,7 @@ GSD_QUERY uint32_t gsd_leaf_at(const gsd_view *view, const gsd_handle *handle, u
 /* The cell as a handle. cell < view->cell_count; larger ones give the uniform density. For forests. [any thread] */
 GSD_QUERY gsd_handle gsd_find_cell(const gsd_view *view, uint32_t cell)
 {
-    gsd_handle handle = {0, 0, 0, 0, 0, 1.0f, 0, {0, 0, 0}, 0};
+    gsd_handle handle = {0, 0, 0, 0, 0, 1.0f, 0, {0, 0, 0}, 0, {0, 0, 0}};
     if (cell < view->cell_count) {
         const gsd_cell *c = &view->cells[cell];
         handle.cell = cell;
@@ -612,6 +625,47 @@ GSD_QUERY gsd_handle gsd_find_cell(const gsd_view *view, uint32_t cell)
         handle.reflected = c->reflected;
     }
     return handle;
+}
+
+/* Position relative to a pivot in radii 1 / nearness of the sphere around it, pulled within GSD_MOST_OFFSET of it. */
+#define GSD_MOST_OFFSET 0.8f
+GSD_QUERY void gsd_offset(const float pivot[3], float nearness, const float position[3], float offset[3])
+{
+    float x = (position[0] - pivot[0]) * nearness, y = (position[1] - pivot[1]) * nearness;
+    float z = (position[2] - pivot[2]) * nearness, l = x * x + y * y + z * z, f = 1;
+    if (!(l <= GSD_MOST_OFFSET * GSD_MOST_OFFSET)) {
+        f = l < 1e30f ? GSD_MOST_OFFSET / sqrtf(l) : 0;
+        x = l < 1e30f ? x : 0; /* what is not finite must not meet the 0 */
+        y = l < 1e30f ? y : 0;
+        z = l < 1e30f ? z : 0;
+    }
+    offset[0] = x * f;
+    offset[1] = y * f;
+    offset[2] = z * f;
+}
+
+/* Direction from the offset to that from the pivot to the same point of the sphere, o + t w. Returns solid angle there
+   per solid angle here: t^2 / s with s^2 = 1 - |o|^2 + (o . w)^2, t = s - o . w. Without offset nothing changes. */
+GSD_QUERY float gsd_to_pivot(const float offset[3], const float direction[3], float out[3])
+{
+    float b = (offset[0] * direction[0] + offset[1] * direction[1]) + offset[2] * direction[2];
+    float l = (offset[0] * offset[0] + offset[1] * offset[1]) + offset[2] * offset[2];
+    float s = sqrtf((1 - l) + b * b), t = s - b;
+    out[0] = offset[0] + t * direction[0];
+    out[1] = offset[1] + t * direction[1];
+    out[2] = offset[2] + t * direction[2];
+    t = t * t / s;
+    return t < 8 ? t : 1; /* more only where the direction is not unit; NaN too */
+}
+
+/* The other way, in place: w - o, normalised. */
+GSD_QUERY void gsd_from_pivot(const float offset[3], float direction[3])
+{
+    float x = direction[0] - offset[0], y = direction[1] - offset[1], z = direction[2] - offset[2];
+    float f = 1 / sqrtf((x * x + y * y) + z * z);
+    direction[0] = x * f;
+    direction[1] = y * f;
+    direction[2] = z * f;
 }
 
 /* Position along one axis to a 24-bit coordinate; outside and NaN are clamped. */
@@ -643,18 +697,27 @@ GSD_QUERY uint32_t gsd_cell_at(const gsd_view *view, const uint32_t g[3])
 GSD_QUERY uint32_t gsd_cell_extent(uint32_t level, uint32_t axis) { return 16777216u >> ((level + 2 - axis) / 3); }
 
 /* Cosine that bin k of the 8 x 8 bins of directions counts with for a surface normal: the cosine t to the mean of the
-   bin's directions, softened near the horizon, which cuts through bins, and at least GSD_BELOW, so that no light is
-   lost: GSD_BELOW + (0 | (t + h)^2 / 4h | t) for t (< -h | between | > h), h = GSD_HORIZON. */
+   bin's directions (less lift, which is 0 where there is no offset: gsd_lift), softened near the horizon, which cuts
+   through bins, and at least GSD_BELOW, so that no light is lost: GSD_BELOW + (0 | (t + h)^2 / 4h | t) for t (< -h |
+   between | > h), h = GSD_HORIZON. */
 #define GSD_HORIZON 0.25f
 #define GSD_BELOW 0.02f
-GSD_QUERY float gsd_bin_cosine(const gsd_view *view, const float normal[3], uint32_t k)
+GSD_QUERY float gsd_bin_cosine(const gsd_view *view, const float normal[3], float lift, uint32_t k)
 {
     const float *b = view->bins + k;
-    float t = (normal[0] * b[0] + normal[1] * b[64]) + normal[2] * b[128], r = t + GSD_HORIZON, above = t - GSD_HORIZON;
+    float t = ((normal[0] * b[0] + normal[1] * b[64]) + normal[2] * b[128]) - lift, r = t + GSD_HORIZON;
+    float above = t - GSD_HORIZON;
     r = r > 0 ? r : 0;
     r = r < 2 * GSD_HORIZON ? r : 2 * GSD_HORIZON;
     above = above > 0 ? above : 0;
     return r * r * (0.25f / GSD_HORIZON) + (above + GSD_BELOW);
+}
+
+/* How far the place lies above its pivot: a point of the sphere is above the surface where its cosine as seen from the
+   pivot exceeds this. */
+GSD_QUERY float gsd_lift(const float offset[3], const float normal[3])
+{
+    return offset[0] * normal[0] + offset[1] * normal[1] + offset[2] * normal[2];
 }
 
 /* Multiply a handle's density by the cosine to a normal (unit, on the side that light comes from): gsd_find does it
@@ -665,12 +728,13 @@ GSD_QUERY void gsd_orient(const gsd_view *view, gsd_handle *handle, const float 
     const float *mass = view->masses + handle->jump;
     float z[8] = {0, 0, 0, 0, 0, 0, 0, 0};
     float l = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2];
+    float lift = gsd_lift(handle->offset, normal);
     uint32_t k, i;
     if (handle->jump == 0 || handle->alpha >= 1 || !(l > 0.5f && l < 2))
         return;
     for (k = 0; k < 64; k += 8)
         for (i = 0; i < 8; ++i)
-            z[i] += mass[k + i] * gsd_bin_cosine(view, normal, k + i);
+            z[i] += mass[k + i] * gsd_bin_cosine(view, normal, lift, k + i);
     memcpy(handle->normal, normal, sizeof handle->normal);
     handle->product = 1 / (((z[0] + z[1]) + (z[2] + z[3])) + ((z[4] + z[5]) + (z[6] + z[7])));
 }
@@ -695,32 +759,40 @@ GSD_QUERY gsd_handle gsd_find(const gsd_view *view, const float position[3], con
         cell = gsd_cell_at(view, g);
     }
     handle = gsd_find_cell(view, cell);
+    gsd_offset(view->cells[cell].pivot, view->cells[cell].nearness, position, handle.offset);
     if (normal)
         gsd_orient(view, &handle, normal);
     return handle;
 }
 
-/* A leaf's density as this handle sees it: (1 - e) learned * cosine / mean cosine + e / (4 pi). x, y: a direction in
-   the leaf. */
-GSD_QUERY float gsd_oriented(const gsd_view *view, const gsd_handle *handle, float pdf, uint32_t x, uint32_t y)
+/* A leaf's density as this handle sees it: (1 - e) learned * cosine / mean cosine * scale + e / (4 pi). x, y: a
+   direction in the leaf; scale: of gsd_to_pivot. */
+GSD_QUERY float gsd_oriented(const gsd_view *view, const gsd_handle *handle, float pdf, uint32_t x, uint32_t y,
+                             float scale)
 {
     float even = view->uniform * GSD_INV_4PI;
-    if (!(handle->product > 0))
+    if (!(handle->product > 0) && scale == 1)
         return pdf;
-    pdf = pdf > even ? pdf - even : 0;
-    return pdf * (gsd_bin_cosine(view, handle->normal, (y >> 21) * 8 + (x >> 21)) * handle->product) + even;
+    pdf = (pdf > even ? pdf - even : 0) * scale;
+    if (handle->product > 0)
+        pdf *=
+            gsd_bin_cosine(view, handle->normal, gsd_lift(handle->offset, handle->normal), (y >> 21) * 8 + (x >> 21)) *
+            handle->product;
+    return pdf + even;
 }
 
 /* Density (1/sr) with which gsd_sample draws this direction (unit); > 0 everywhere. [any thread] */
 GSD_QUERY float gsd_pdf(const gsd_view *view, const gsd_handle *handle, const float direction[3])
 {
     uint32_t x, y;
-    gsd_coordinates(direction, &x, &y);
-    return gsd_oriented(view, handle, view->nodes[gsd_leaf_at(view, handle, x, y)].leaf.pdf, x, y);
+    float seen[3], scale = gsd_to_pivot(handle->offset, direction, seen);
+    gsd_coordinates(seen, &x, &y);
+    return gsd_oriented(view, handle, view->nodes[gsd_leaf_at(view, handle, x, y)].leaf.pdf, x, y, scale);
 }
 
 /* Direction at (tx, ty) in [0, 1)^2 within a leaf, and the density of the rounded direction: the leaf's, unless the
-   direction is so near to the leaf's edge (2 of 2^24 units) that it may have crossed it. */
+   direction is so near to the leaf's edge (GSD_EDGE of 2^24 units) that it may have crossed it. */
+#define GSD_EDGE 6
 GSD_QUERY float gsd_sample_leaf(const gsd_view *view, const gsd_handle *handle, uint32_t node, double tx, double ty,
                                 float direction[3])
 {
@@ -728,14 +800,17 @@ GSD_QUERY float gsd_sample_leaf(const gsd_view *view, const gsd_handle *handle, 
     uint32_t left = leaf->leaf.x & 0xffffffu, low = leaf->leaf.y;
     double size = (double)(16777216u >> (leaf->leaf.x >> 24));
     double fx, fy;
+    float seen[3];
     tx = tx > 0 ? tx : 0;
     ty = ty > 0 ? ty : 0;
     fx = (tx < 0.99999999988 ? tx : 0.99999999988) * size;
     fy = (ty < 0.99999999988 ? ty : 0.99999999988) * size;
     gsd_direction((double)left + fx, (double)low + fy, direction);
-    if (fx < 2 || fx > size - 2 || fy < 2 || fy > size - 2 || (handle->product > 0 && size > 2097152))
+    gsd_from_pivot(handle->offset, direction);
+    if (fx < GSD_EDGE || fx > size - GSD_EDGE || fy < GSD_EDGE || fy > size - GSD_EDGE ||
+        (handle->product > 0 && size > 2097152))
         return gsd_pdf(view, handle, direction);
-    return gsd_oriented(view, handle, leaf->leaf.pdf, left, low);
+    return gsd_oriented(view, handle, leaf->leaf.pdf, left, low, gsd_to_pivot(handle->offset, direction, seen));
 }
 
 /* Place of r (0 .. 1) among 8 weights; r becomes the place within that weight's share. Without branches. */
@@ -779,9 +854,10 @@ GSD_QUERY void gsd_leave_bin(const gsd_node *node, uint32_t bin, double r[2])
 GSD_QUERY void gsd_bin_weights(const gsd_view *view, const gsd_handle *handle, float weight[64], float row[8])
 {
     const float *mass = view->masses + handle->jump;
+    float lift = gsd_lift(handle->offset, handle->normal);
     uint32_t k, y;
     for (k = 0; k < 64; ++k)
-        weight[k] = mass[k] * gsd_bin_cosine(view, handle->normal, k);
+        weight[k] = mass[k] * gsd_bin_cosine(view, handle->normal, lift, k);
     for (y = 0; y < 8; ++y) {
         const float *w = weight + y * 8;
         row[y] = ((w[0] + w[1]) + (w[2] + w[3])) + ((w[4] + w[5]) + (w[6] + w[7]));
@@ -877,12 +953,13 @@ GSD_QUERY void gsd_unpack_normal(const uint32_t packed[2], float normal[3])
 
 /* A training sample from scalars (channel means); normal: what gsd_find got, NULL = none. [any thread] */
 GSD_QUERY gsd_training_sample gsd_make_scalar_sample(const float position[3], const float direction[3],
-                                                     const float *normal, float radiance, float contribution,
-                                                     float pixel_contribution, float pdf_mix, float pdf_bsdf,
-                                                     float pdf_guide)
+                                                     const float *normal, float distance, float radiance,
+                                                     float contribution, float pixel_contribution, float pdf_mix,
+                                                     float pdf_bsdf, float pdf_guide)
 {
     gsd_training_sample s;
     memcpy(s.position, position, sizeof s.position);
+    s.nearness = distance > 0 ? 1 / distance : -1; /* -1: will be refused, NaN too */
     s.radiance = radiance;
     s.contribution = contribution;
     s.pixel_contribution = pixel_contribution;
@@ -896,7 +973,7 @@ GSD_QUERY gsd_training_sample gsd_make_scalar_sample(const float position[3], co
    without the cosine, pixel_weight throughput before this vertex / pixel estimate (NULL = 1; only the variance-aware
    target needs it). [any thread] */
 GSD_QUERY gsd_training_sample gsd_make_sample(const float position[3], const float direction[3], const float *normal,
-                                              const float L[3], const float f[3], float cosine,
+                                              float distance, const float L[3], const float f[3], float cosine,
                                               const float pixel_weight[3], float pdf_mix, float pdf_bsdf,
                                               float pdf_guide)
 {
@@ -908,8 +985,8 @@ GSD_QUERY gsd_training_sample gsd_make_sample(const float position[3], const flo
         contribution += v;
         pixel += pixel_weight ? v * pixel_weight[c] : v;
     }
-    return gsd_make_scalar_sample(position, direction, normal, radiance, contribution, pixel, pdf_mix, pdf_bsdf,
-                                  pdf_guide);
+    return gsd_make_scalar_sample(position, direction, normal, distance, radiance, contribution, pixel, pdf_mix,
+                                  pdf_bsdf, pdf_guide);
 }
 
 /* ---- >>batch ------------------------------------------------------------------------------------------------ */
@@ -1006,6 +1083,8 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_MIN_REBUILDS 3       /* before that verdict: the first trees are noise */
 #define GSDI_SPLIT 2.0            /* a cell splits above that times sqrt(samples held): tuned on SF1 (1 .. 2), ajar */
 #define GSDI_MIN_SPLIT 32.0       /* at least */
+#define GSDI_MOST_REACH 0.7 /* a cell lies within so many radii of a new pivot: the sphere is made larger for it */
+#define GSDI_KEPT_REACH 0.6 /* and of one that it keeps */
 #define GSDI_LIT                                                                                                       \
     24.0                      /* ... times its share of non-zero samples: parts of a dark cell would know too little;  \
                                  tuned on lamps, ajar (8 .. 32) */
@@ -1070,6 +1149,7 @@ typedef struct gsdi_state {
     double weight;                 /* sum of contribution / p */
     double pixel, pixel_v;         /* sum of x_1 (pixel contribution / contribution)^2, and of x_1 beside it */
     double flow;                   /* sum of contribution / p of this pass */
+    double mass, near_mass;        /* sum of what went into the quadtree, and of that times 1 / distance */
     float theta, moment1, moment2; /* Adam: alpha = sigmoid(theta) */
     uint32_t steps;
     float alpha;    /* learned; what queries see is in gsd_cell */
@@ -1082,6 +1162,8 @@ typedef struct gsdi_state {
     uint32_t rebuilds; /* times its sampling tree was rebuilt */
     uint32_t hits;     /* non-zero samples that the gate took in this pass */
     float reflected;   /* flow / fresh of the last pass that had enough samples, 0 = none had */
+    float pivot[3];    /* where its sums are seen from: see gsd_cell */
+    float nearness;
     uint32_t bins[64]; /* held by 4 x 4 x 4 sub-cells, index x y z with 2 bits each, for several splits at once */
 } gsdi_state;
 
@@ -2521,8 +2603,8 @@ typedef struct gsdi_item {
     uint32_t y;  /* 24-bit coordinate */
     float value; /* radiance, contribution or pixel contribution, as the target asks */
     float contribution, pdf_mix, pdf_bsdf, pdf_guide;
-    float pixel;     /* pixel contribution; then the weight that goes into the quadtree */
-    uint32_t normal; /* as packed: 8 + 8 bits */
+    float pixel;    /* pixel contribution; then the weight that goes into the quadtree */
+    float nearness; /* 1 / distance, at most gsdi_accumulation.nearest */
 } gsdi_item;
 
 typedef struct gsdi_segment {
@@ -2536,6 +2618,7 @@ typedef struct gsdi_accumulation {
     gsd_view view;
     gsd_target target; /* of this pass: never switching */
     bool second_moment, stochastic, box, judge;
+    float nearest; /* larger nearness is taken for this: a thousandth of the field's extent */
     uint32_t total;
     gsdi_segment *segments;
     uint32_t segment_count, segment_capacity;
@@ -2554,7 +2637,8 @@ static bool gsdi_sample_valid(const gsd_training_sample *s)
     return s->radiance >= 0 && s->radiance < most && s->contribution >= 0 && s->contribution < most &&
            s->pixel_contribution >= 0 && s->pixel_contribution < most && s->pdf_mix > 0 && s->pdf_mix <= finite &&
            s->pdf_bsdf >= 0 && s->pdf_bsdf <= finite && s->pdf_guide >= 0 && s->pdf_guide <= finite &&
-           s->radiance < most * s->pdf_mix && gsdi_finite(s->position[0] + s->position[1] + s->position[2]);
+           s->nearness >= 0 && s->nearness <= finite && s->radiance < most * s->pdf_mix &&
+           gsdi_finite(s->position[0] + s->position[1] + s->position[2]);
 }
 
 /* Cells of a sample: where it lies and where it is added. Sets the item's bin. False: no such cell. */
@@ -2593,6 +2677,43 @@ static bool gsdi_locate(gsdi_accumulation *a, const gsd_training_sample *s, uint
     return true;
 }
 
+/* The guide's density of a sample whose vertex did not ask for it. */
+static float gsdi_sample_pdf(const gsdi_accumulation *a, const gsd_training_sample *s, uint32_t cell,
+                             const float direction[3], const float normal[3])
+{
+    gsd_handle handle = gsd_find_cell(&a->view, cell);
+    if (!a->field->desc.forest_cells)
+        gsd_offset(a->view.cells[cell].pivot, a->view.cells[cell].nearness, s->position, handle.offset);
+    handle.alpha = 0; /* closed cells too */
+    gsd_orient(&a->view, &handle, normal);
+    return gsd_pdf(&a->view, &handle, direction);
+}
+
+/* A sample that is not zero as its quadtree sees it: coordinates, value per solid angle there, without the cosine,
+   which is multiplied in when sampling. */
+static void gsdi_see(const gsdi_accumulation *a, const gsd_training_sample *s, uint32_t at, gsdi_item *item)
+{
+    const gsdi_state *state = &a->field->states[a->target_cell[at]];
+    float direction[3], seen[3], offset[3] = {0, 0, 0}, normal[3], scale = 1;
+    gsd_unpack_normal(s->direction, normal);
+    gsd_direction((double)(s->direction[0] & 0xffffffu) + 0.5, (double)(s->direction[1] & 0xffffffu) + 0.5, direction);
+    if (!(item->pdf_guide > 0) && (a->judge || (a->second_moment && !a->field->desc.no_guide_weight)))
+        item->pdf_guide = gsdi_sample_pdf(a, s, a->read_cell[at], direction, normal);
+    if (state->nearness > 0) { /* never in a forest */
+        uint32_t bin = item->x & 0xff000000u;
+        gsd_offset(state->pivot, state->nearness, s->position, offset);
+        scale = gsd_to_pivot(offset, direction, seen);
+        gsd_coordinates(seen, &item->x, &item->y);
+        item->x |= bin;
+    }
+    if (!a->second_moment)
+        return;
+    if (s->direction[0] >> 24)
+        item->value /=
+            gsd_bin_cosine(&a->view, normal, gsd_lift(offset, normal), (item->y >> 21) * 8 + (item->x >> 21 & 7u));
+    item->value /= sqrtf(scale); /* it will be squared */
+}
+
 /* Check samples, find their cells and leaf coordinates. */
 static void gsdi_prepare(void *context, uint32_t begin, uint32_t end)
 {
@@ -2612,7 +2733,7 @@ static void gsdi_prepare(void *context, uint32_t begin, uint32_t end)
             }
             item->x = s->direction[0] & 0xffffffu;
             item->y = s->direction[1] & 0xffffffu;
-            item->normal = s->direction[0] >> 24 | s->direction[1] >> 24 << 8;
+            item->nearness = s->nearness < a->nearest ? s->nearness : a->nearest;
             if (!gsdi_locate(a, s, at, item, segment)) {
                 segment->refused++;
                 a->read_cell[at] = a->target_cell[at] = GSDI_NONE;
@@ -2622,16 +2743,13 @@ static void gsdi_prepare(void *context, uint32_t begin, uint32_t end)
                           : a->target == GSD_TARGET_SIMPLE ? s->contribution
                                                            : s->pixel_contribution;
             item->value = rejected ? 0 : item->value;
-            if (a->second_moment && item->value > 0 && item->normal) { /* the cosine is multiplied in when sampling */
-                float normal[3];
-                gsd_unpack_normal(s->direction, normal);
-                item->value /= gsd_bin_cosine(&a->view, normal, (item->y >> 21) * 8 + (item->x >> 21 & 7u));
-            }
             item->contribution = rejected ? 0 : s->contribution;
             item->pixel = rejected ? 0 : s->pixel_contribution;
             item->pdf_mix = s->pdf_mix;
             item->pdf_bsdf = s->pdf_bsdf;
             item->pdf_guide = s->pdf_guide;
+            if (item->contribution > 0 || item->value > 0)
+                gsdi_see(a, s, at, item);
             segment->rejected += rejected;
             segment->zeros += !(s->radiance > 0) || !(s->contribution > 0);
         }
@@ -2684,20 +2802,6 @@ static void gsdi_gate_add(gsdi_state *state, double g, double pixel, double p, d
     state->pixel_v += x[GSDI_GATE_LOW];
 }
 
-/* The guide's density of an item whose vertex did not ask for it. */
-static double gsdi_item_pdf(const gsdi_accumulation *a, const gsd_handle *handle, const gsdi_item *item)
-{
-    gsd_handle oriented = *handle;
-    uint32_t x = item->x & 0xffffffu, y = item->y, packed[2];
-    float normal[3];
-    packed[0] = item->normal << 24;
-    packed[1] = item->normal >> 8 << 24;
-    gsd_unpack_normal(packed, normal);
-    oriented.alpha = 0;
-    gsd_orient(&a->view, &oriented, normal);
-    return (double)gsd_oriented(&a->view, &oriented, a->view.nodes[gsd_leaf_at(&a->view, handle, x, y)].leaf.pdf, x, y);
-}
-
 /* Learn from one item in the cell where it lies; sets the weight that goes into the quadtree. */
 static void gsdi_learn(const gsdi_accumulation *a, gsdi_state *state, const gsd_handle *handle, gsdi_item *item)
 {
@@ -2711,8 +2815,6 @@ static void gsdi_learn(const gsdi_accumulation *a, gsdi_state *state, const gsd_
     state->bins[item->x >> 24] += 1;
     judge = judge && (state->hits < GSDI_ENOUGH_HITS || ((uint32_t)(int64_t)state->fresh & 7u) == 0);
     state->gate_count += judge;
-    if (((judge && c > 0) || weigh) && !(pg > 0))
-        pg = gsdi_item_pdf(a, handle, item);
     if (judge && c > 0) {
         state->hits++;
         gsdi_gate_add(state, c, (double)item->pixel, p, pb, handle->root ? pg : pb); /* without a tree: neutral */
@@ -2729,7 +2831,10 @@ static void gsdi_learn(const gsdi_accumulation *a, gsdi_state *state, const gsd_
         value *= value;
     }
     value /= p;
-    item->pixel = (float)(value < 1e30 ? value : 1e30);
+    value = value < 1e30 ? value : 1e30;
+    item->pixel = (float)value;
+    state->mass += value;
+    state->near_mass += value * (double)item->nearness;
 }
 
 static void gsdi_cell_map(const gsdi_accumulation *a, uint32_t cell, gsdi_map *map)
@@ -2768,7 +2873,7 @@ static void gsdi_learn_cells(void *context, uint32_t begin, uint32_t end)
             gsdi_item *item = &a->items[a->order[i]];
             if (i + 8 < last) {
                 GSDI_PREFETCH(&a->items[a->order[i + 8]].x);
-                GSDI_PREFETCH(&a->items[a->order[i + 8]].normal); /* may lie in the next cache line */
+                GSDI_PREFETCH(&a->items[a->order[i + 8]].nearness); /* may lie in the next cache line */
             }
             gsdi_learn(a, state, &handle, item);
             if (!a->stochastic)
@@ -2850,6 +2955,7 @@ static bool gsdi_accumulation_start(gsdi_accumulation *a, gsd_field *field, uint
     a->box = desc->directional_filter == GSD_DIRECTIONAL_BOX;
     a->judge = !desc->no_gate || desc->alpha_mode != GSD_ALPHA_FIXED;
     a->segment_capacity = GSDI_ROUND / 64;
+    a->nearest = 1000 * field->block->scale / 16777216;
     size = n * (sizeof(gsdi_item) + 3 * 4) + a->segment_capacity * sizeof(gsdi_segment) + (cells * 2 + 3) * 4;
     if (field->scratch_size < size) {
         gsdi_release(desc, field->scratch);
@@ -3980,7 +4086,29 @@ static void gsdi_cell_write(gsdi_block *b, const gsdi_tree *trees, gsd_cell *cel
     cell->gate = s->gate;
     cell->reflected = s->reflected;
     cell->depth = t->max_depth;
+    cell->pivot[0] = cell->pivot[1] = cell->pivot[2] = cell->nearness = 0; /* the caller knows better */
     cell->alpha = t->groups == 0 || s->gate == GSD_GATE_CLOSED ? 1.0f : s->alpha;
+}
+
+/* Where the sums of the next pass are seen from: see Parallax. */
+static void gsdi_choose_pivot(const gsdi_block *b, gsdi_state *s)
+{
+    double size = 1 / (double)b->scale, radius = 0, reach = 0, middle[3];
+    double nearness = s->mass > 0 ? s->near_mass / s->mass : 0, now = (double)s->nearness;
+    uint32_t axis;
+    for (axis = 0; axis < 3; ++axis) {
+        double half = 0.5 * (double)gsd_cell_extent(s->level, axis) * size, far;
+        middle[axis] = (double)b->origin[axis] + (double)s->origin[axis] * size + half;
+        far = fabs(middle[axis] - (double)s->pivot[axis]) + half;
+        radius += half * half;
+        reach += far * far;
+    }
+    nearness = fmin(nearness, GSDI_MOST_REACH / sqrt(radius));
+    if (now > 0 && sqrt(reach) * now < GSDI_KEPT_REACH && nearness < 2 * now && now < 2 * nearness)
+        return;
+    for (axis = 0; axis < 3; ++axis)
+        s->pivot[axis] = (float)middle[axis];
+    s->nearness = (float)nearness;
 }
 
 /* State, building tree and query record of new cells [begin, end). */
@@ -3992,6 +4120,8 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
         const gsdi_place *p = &r->places[i];
         const gsdi_state *old = &r->field->states[p->source];
         const gsdi_job *job = &r->jobs[p->source];
+        const gsd_cell *was = &gsdi_cells(r->field->block)[p->source];
+        gsd_cell *cell = &gsdi_cells(r->block)[i];
         gsdi_state *s = &r->states[i];
         double total = 0, share, keep = 0;
         *s = *old;
@@ -4013,6 +4143,10 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
                                  r->child + p->first, r->sum + p->first);
             s->held = old->held * keep;
             s->lit = old->lit * keep;
+            s->mass *= r->keep;
+            s->near_mass *= r->keep;
+            if (!r->desc->forest_cells)
+                gsdi_choose_pivot(r->block, s);
             s->rebuilds = old->rebuilds < 1000000u ? old->rebuilds + 1 : old->rebuilds;
             for (k = 0; k < 64; ++k)
                 s->bins[k] = p->level == old->level ? (uint32_t)((double)old->bins[k] * r->keep) : 0;
@@ -4020,13 +4154,15 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
             gsdi_gate_scale(s, share);
         }
         if (r->clear) { /* another target: what waits is of no use */
-            s->held = s->lit = 0;
+            s->held = s->lit = s->mass = s->near_mass = 0;
             memset(s->bins, 0, sizeof s->bins);
             memset(r->sum + p->first, 0, p->count * sizeof *r->sum);
         }
         s->fresh = s->flow = 0;
         s->hits = 0;
-        gsdi_cell_write(r->block, r->trees, &gsdi_cells(r->block)[i], s, job->tree);
+        gsdi_cell_write(r->block, r->trees, cell, s, job->tree);
+        memcpy(cell->pivot, job->rebuild ? old->pivot : was->pivot, sizeof cell->pivot);
+        cell->nearness = job->rebuild ? old->nearness : was->nearness;
     }
 }
 
@@ -4142,6 +4278,8 @@ static uint64_t gsdi_structure_hash(const gsdi_state *states, uint32_t cells, co
         h = gsdi_hash(h, (uint64_t)s->first << 32 | s->count);
         h = gsdi_hash(h, (uint64_t)s->origin[0] << 32 | s->origin[1]);
         h = gsdi_hash(h, (uint64_t)s->origin[2] << 32 | s->level);
+        h = gsdi_hash_bytes(h, s->pivot, sizeof s->pivot); /* sums that are seen from elsewhere do not add up */
+        h = gsdi_hash_bytes(h, &s->nearness, sizeof s->nearness);
     }
     return gsdi_hash_bytes(h, child, (size_t)nodes * sizeof *child);
 }
@@ -4634,12 +4772,13 @@ static float *gsdi_row_out(float *base, size_t stride, uint32_t row)
 #define GSDI_AVX2 __attribute__((target("avx2")))
 
 /* A row of eight bins: gsd_bin_cosine times mass, in the same operations. */
-GSDI_AVX2 static __m256 gsdi_bin_row_avx2(const gsd_view *view, const __m256 normal[3], const float *mass, uint32_t k)
+GSDI_AVX2 static __m256 gsdi_bin_row_avx2(const gsd_view *view, const __m256 normal[4], const float *mass, uint32_t k)
 {
     __m256 h = _mm256_set1_ps(GSD_HORIZON), zero = _mm256_setzero_ps(), t, r, above;
     t = _mm256_add_ps(_mm256_mul_ps(normal[0], _mm256_loadu_ps(view->bins + k)),
                       _mm256_mul_ps(normal[1], _mm256_loadu_ps(view->bins + GSDI_BINS + k)));
     t = _mm256_add_ps(t, _mm256_mul_ps(normal[2], _mm256_loadu_ps(view->bins + 2 * GSDI_BINS + k)));
+    t = _mm256_sub_ps(t, normal[3]);
     r = _mm256_min_ps(_mm256_max_ps(_mm256_add_ps(t, h), zero), _mm256_set1_ps(2 * GSD_HORIZON));
     above = _mm256_add_ps(_mm256_max_ps(_mm256_sub_ps(t, h), zero), _mm256_set1_ps(GSD_BELOW));
     r = _mm256_add_ps(_mm256_mul_ps(_mm256_mul_ps(r, r), _mm256_set1_ps(0.25f / GSD_HORIZON)), above);
@@ -4649,13 +4788,14 @@ GSDI_AVX2 static __m256 gsdi_bin_row_avx2(const gsd_view *view, const __m256 nor
 /* gsd_orient. */
 GSDI_AVX2 static void gsdi_orient_avx2(const gsd_view *view, gsd_handle *handle, const float *n)
 {
-    __m256 normal[3], z = _mm256_setzero_ps();
+    __m256 normal[4], z = _mm256_setzero_ps();
     float s[8], l = n[0] * n[0] + n[1] * n[1] + n[2] * n[2];
     uint32_t k;
     if (handle->jump == 0 || handle->alpha >= 1 || !(l > 0.5f && l < 2))
         return;
     for (k = 0; k < 3; ++k)
         normal[k] = _mm256_set1_ps(n[k]);
+    normal[3] = _mm256_set1_ps(gsd_lift(handle->offset, n));
     for (k = 0; k < GSDI_BINS; k += 8)
         z = _mm256_add_ps(z, gsdi_bin_row_avx2(view, normal, view->masses + handle->jump, k));
     _mm256_storeu_ps(s, z);
@@ -4666,10 +4806,11 @@ GSDI_AVX2 static void gsdi_orient_avx2(const gsd_view *view, gsd_handle *handle,
 /* gsd_bin_weights. */
 GSDI_AVX2 static void gsdi_bin_weights_avx2(const gsd_view *view, const gsd_handle *handle, float *weight, float *row)
 {
-    __m256 normal[3], w[8], a, b;
+    __m256 normal[4], w[8], a, b;
     uint32_t k;
     for (k = 0; k < 3; ++k)
         normal[k] = _mm256_set1_ps(handle->normal[k]);
+    normal[3] = _mm256_set1_ps(gsd_lift(handle->offset, handle->normal));
     for (k = 0; k < 8; ++k) {
         w[k] = gsdi_bin_row_avx2(view, normal, view->masses + handle->jump, k * 8);
         _mm256_storeu_ps(weight + k * 8, w[k]);
@@ -4719,6 +4860,8 @@ GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t
         for (i = 0; i < n; ++i) {
             uint32_t at = gsdi_at(index, start + i);
             handles[at] = gsd_find_cell(view, cell[i]);
+            gsd_offset(view->cells[cell[i]].pivot, view->cells[cell[i]].nearness,
+                       gsdi_row(positions, position_stride, at), handles[at].offset);
             if (alpha)
                 alpha[at] = handles[at].alpha;
             for (k = 0; normals && k < GSDI_BINS; k += 16)
@@ -4759,10 +4902,12 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
     for (start = 0; start < count; start += GSDI_LANES) {
         uint32_t n = count - start < GSDI_LANES ? count - start : GSDI_LANES;
         uint32_t node[GSDI_LANES], xy[GSDI_LANES][2], shift[GSDI_LANES];
+        float scale[GSDI_LANES], seen[3];
         for (i = 0; i < n; ++i) {
             uint32_t at = gsdi_at(index, start + i);
             const gsd_handle *h = &handles[at];
-            gsd_coordinates(gsdi_row(directions, direction_stride, at), &xy[i][0], &xy[i][1]);
+            scale[i] = gsd_to_pivot(h->offset, gsdi_row(directions, direction_stride, at), seen);
+            gsd_coordinates(seen, &xy[i][0], &xy[i][1]);
             shift[i] = h->jump;
             node[i] = h->jump ? h->jump + (xy[i][1] >> 21) * 8 + (xy[i][0] >> 21) : h->root;
             if (h->jump)
@@ -4780,7 +4925,7 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
         gsdi_descend(view, n, node, xy, shift);
         for (i = 0; i < n; ++i) {
             uint32_t at = gsdi_at(index, start + i);
-            pdf[at] = gsd_oriented(view, &handles[at], view->nodes[node[i]].leaf.pdf, xy[i][0], xy[i][1]);
+            pdf[at] = gsd_oriented(view, &handles[at], view->nodes[node[i]].leaf.pdf, xy[i][0], xy[i][1], scale[i]);
         }
     }
 }
@@ -4880,8 +5025,9 @@ typedef struct gsdi_draws {
     uint32_t bits[2][GSDI_LANES]; /* of u, 24 each; then [1]: the bin of a product */
     uint32_t node[GSDI_LANES];
     float out[3][GSDI_LANES], pdf[GSDI_LANES];
-    uint32_t edge[GSDI_LANES]; /* not 0: near the leaf's edge */
-    uint32_t deep[GSDI_LANES]; /* not 0: the leaf lies within one bin */
+    float offset[3][GSDI_LANES], scale[GSDI_LANES]; /* of the handle; of gsd_to_pivot */
+    uint32_t edge[GSDI_LANES];                      /* not 0: near the leaf's edge */
+    uint32_t deep[GSDI_LANES];                      /* not 0: the leaf lies within one bin */
 } gsdi_draws;
 
 /* Four 32-bit numbers without sign as doubles. */
@@ -5009,8 +5155,8 @@ GSDI_AVX2 static void gsdi_leaves_avx2(const gsd_node *nodes, gsdi_draws *d, uin
                     f;
             t = _mm256_max_pd(t, _mm256_setzero_pd());
             f = _mm256_mul_pd(_mm256_min_pd(t, _mm256_set1_pd(0.99999999988)), size);
-            edge = _mm256_or_pd(edge, _mm256_cmp_pd(f, _mm256_set1_pd(2), _CMP_LT_OQ));
-            edge = _mm256_or_pd(edge, _mm256_cmp_pd(f, _mm256_sub_pd(size, _mm256_set1_pd(2)), _CMP_GT_OQ));
+            edge = _mm256_or_pd(edge, _mm256_cmp_pd(f, _mm256_set1_pd(GSD_EDGE), _CMP_LT_OQ));
+            edge = _mm256_or_pd(edge, _mm256_cmp_pd(f, _mm256_sub_pd(size, _mm256_set1_pd(GSD_EDGE)), _CMP_GT_OQ));
             _mm256_storeu_pd(&d->r[k][at], _mm256_add_pd(corner[k], f));
         }
         _mm_storeu_si128((__m128i *)(void *)&d->edge[at], gsdi_mask_avx2(edge));
@@ -5056,6 +5202,31 @@ GSDI_AVX2 static void gsdi_directions_avx2(gsdi_draws *d, uint32_t lane)
     _mm256_storeu_ps(&d->out[2][lane], z);
 }
 
+/* gsd_from_pivot, then gsd_to_pivot, for eight lanes. */
+GSDI_AVX2 static void gsdi_see_avx2(gsdi_draws *d, uint32_t lane)
+{
+    __m256 w[3], o[3], one = _mm256_set1_ps(1), l, b, s, t;
+    uint32_t k;
+    for (k = 0; k < 3; ++k) {
+        o[k] = _mm256_loadu_ps(&d->offset[k][lane]);
+        w[k] = _mm256_sub_ps(_mm256_loadu_ps(&d->out[k][lane]), o[k]);
+    }
+    l = _mm256_add_ps(_mm256_mul_ps(w[0], w[0]), _mm256_mul_ps(w[1], w[1]));
+    l = _mm256_div_ps(one, _mm256_sqrt_ps(_mm256_add_ps(l, _mm256_mul_ps(w[2], w[2]))));
+    for (k = 0; k < 3; ++k) {
+        w[k] = _mm256_mul_ps(w[k], l);
+        _mm256_storeu_ps(&d->out[k][lane], w[k]);
+    }
+    b = _mm256_add_ps(_mm256_mul_ps(o[0], w[0]), _mm256_mul_ps(o[1], w[1]));
+    b = _mm256_add_ps(b, _mm256_mul_ps(o[2], w[2]));
+    l = _mm256_add_ps(_mm256_mul_ps(o[0], o[0]), _mm256_mul_ps(o[1], o[1]));
+    l = _mm256_add_ps(l, _mm256_mul_ps(o[2], o[2]));
+    s = _mm256_sqrt_ps(_mm256_add_ps(_mm256_sub_ps(one, l), _mm256_mul_ps(b, b)));
+    t = _mm256_sub_ps(s, b);
+    t = _mm256_div_ps(_mm256_mul_ps(t, t), s);
+    _mm256_storeu_ps(&d->scale[lane], _mm256_blendv_ps(one, t, _mm256_cmp_ps(t, _mm256_set1_ps(8), _CMP_LT_OQ)));
+}
+
 static bool gsdi_aliased(const gsd_handle *h) { return h->alias_count && !(h->product > 0); }
 
 /* Up to 64 draws. Those of the uniform share, and what has no alias table in a field of them, are done one by one. */
@@ -5076,6 +5247,8 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
             d.width[k][i] = 1;
         }
         done[i / 8] = false;
+        for (k = 0; k < 3; ++k)
+            d.offset[k][i] = handles[at[i < n ? i : 0]].offset[k];
         d.node[i] = handles[at[i < n ? i : 0]].root;
         GSDI_PREFETCH(&view->nodes[d.node[i]]);
     }
@@ -5132,6 +5305,7 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
     for (i = 0; i < lanes; i += 8) {
         gsdi_leaves_avx2(view->nodes, &d, i);
         gsdi_directions_avx2(&d, i);
+        gsdi_see_avx2(&d, i);
     }
     for (i = 0; i < n; ++i) {
         const gsd_handle *h = &handles[at[i]];
@@ -5145,7 +5319,7 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
         if (d.edge[i] || (h->product > 0 && !d.deep[i]))
             pdf[at[i]] = gsd_pdf(view, h, out);
         else
-            pdf[at[i]] = gsd_oriented(view, h, d.pdf[i], (uint32_t)d.r[0][i], (uint32_t)d.r[1][i]);
+            pdf[at[i]] = gsd_oriented(view, h, d.pdf[i], (uint32_t)d.r[0][i], (uint32_t)d.r[1][i], d.scale[i]);
     }
 }
 #endif
@@ -5582,6 +5756,13 @@ static bool gsdi_building_ok(const gsd_field *field, const gsdi_state *s)
     return used == s->count;
 }
 
+/* A place and a nearness that gsd_offset can work with. */
+static bool gsdi_pivot_ok(const float pivot[3], float nearness)
+{
+    return gsdi_finite(pivot[0]) && gsdi_finite(pivot[1]) && gsdi_finite(pivot[2]) && nearness >= 0 &&
+           gsdi_finite(nearness);
+}
+
 static bool gsdi_state_ok(const gsd_field *field, const gsdi_state *s, const gsd_cell *c, const gsdi_tree *trees)
 {
     const gsdi_tree *t;
@@ -5590,9 +5771,11 @@ static bool gsdi_state_ok(const gsd_field *field, const gsdi_state *s, const gsd
     if (c->tree >= field->block->trees || s->gate > GSD_GATE_CLOSED || !(s->alpha >= 0.049f && s->alpha <= 1) ||
         !(s->reflected >= 0 && s->reflected <= 1e30f) || !(s->theta > -10 && s->theta < 10) ||
         !gsdi_finite(s->moment1) || !gsdi_finite(s->moment2) || !(s->held >= 0 && s->held < 1e18) ||
-        !(s->lit >= 0 && s->lit < 1e18) || !(s->fresh >= 0 && s->fresh < 1e18) || !(s->flow >= 0 && s->flow < 1e50) ||
-        !(s->gate_count >= 0) || !(s->weight >= 0 && s->weight < 1e300) || !(s->pixel >= 0 && s->pixel < 1e300) ||
-        !(s->pixel_v >= 0 && s->pixel_v < 1e300) || s->level > 60)
+        !(s->lit >= 0 && s->lit < 1e18) || !(s->fresh >= 0 && s->fresh < 1e18) || !(s->mass >= 0 && s->mass < 1e50) ||
+        !(s->near_mass >= 0 && s->near_mass < 1e90) || !gsdi_pivot_ok(s->pivot, s->nearness) ||
+        !gsdi_pivot_ok(c->pivot, c->nearness) || (field->desc.forest_cells && (s->nearness > 0 || c->nearness > 0)) ||
+        !(s->flow >= 0 && s->flow < 1e50) || !(s->gate_count >= 0) || !(s->weight >= 0 && s->weight < 1e300) ||
+        !(s->pixel >= 0 && s->pixel < 1e300) || !(s->pixel_v >= 0 && s->pixel_v < 1e300) || s->level > 60)
         return false;
     for (k = 0; k <= GSDI_GATE_LOW; ++k)
         if (!(s->v[k] >= 0 && s->v[k] < 1e300) || !(s->vv[k] >= 0 && s->vv[k] < 1e300))
@@ -5606,6 +5789,8 @@ static bool gsdi_state_ok(const gsd_field *field, const gsdi_state *s, const gsd
     should.alpha = c->alpha;
     should.gate = c->gate;
     should.reflected = c->reflected;
+    memcpy(should.pivot, c->pivot, sizeof should.pivot);
+    should.nearness = c->nearness;
     return memcmp(&should, c, sizeof should) == 0 && c->reflected >= 0 && c->reflected <= 1e30f && c->alpha >= 0.049f &&
            c->alpha <= 1 && c->gate <= GSD_GATE_CLOSED && gsdi_building_ok(field, s);
 }
@@ -5665,6 +5850,8 @@ GSD_API gsd_result gsd_merge(gsd_field *field, const gsd_field *source)
         s->lit += o->lit;
         s->fresh += o->fresh;
         s->flow += o->flow;
+        s->mass += o->mass;
+        s->near_mass += o->near_mass;
         s->gate_count += o->gate_count;
         s->weight += o->weight;
         s->pixel += o->pixel;
@@ -5881,6 +6068,8 @@ GSD_API gsd_result gsd_import_trees(gsd_field *field, const gsd_tree *trees, uin
             gsdi_tree_copy(r.block, tree, old, &gsdi_trees(old)[gsdi_cells(old)[i].tree]);
         }
         gsdi_cell_write(r.block, r.trees, &gsdi_cells(r.block)[i], &field->states[i], job->tree);
+        memcpy(gsdi_cells(r.block)[i].pivot, gsdi_cells(old)[i].pivot, 3 * sizeof(float));
+        gsdi_cells(r.block)[i].nearness = gsdi_cells(old)[i].nearness;
     }
     memcpy((char *)r.block + r.block->trees_at, r.trees, r.tree_count * sizeof(gsdi_tree));
     gsdi_release(r.desc, field->memory);

@@ -85,8 +85,8 @@ static void row_titles(const char *what)
 static gsd_training_sample to_training(const sf1_sample *s)
 {
     float contribution = s->radiance * s->cosine * (float)(1 / SF1_PI);
-    return gsd_make_scalar_sample(s->position, s->direction, s->normal, s->radiance, contribution, contribution, s->pdf,
-                                  s->cosine * (float)(1 / SF1_PI), 0);
+    return gsd_make_scalar_sample(s->position, s->direction, s->normal, s->distance, s->radiance, contribution,
+                                  contribution, s->pdf, s->cosine * (float)(1 / SF1_PI), 0);
 }
 
 /* Draw about n training samples of this update. */

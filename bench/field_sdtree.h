@@ -53,8 +53,8 @@ static const char *field_sdtree_record(void *state, const sf1_sample *samples, c
         for (uint32_t i = 0; i < n; ++i) {
             const sf1_sample *s = &samples[at + i];
             float bsdf = s->cosine * (float)(1 / SF1_PI), contribution = s->radiance * bsdf;
-            batch[i] = gsd_make_scalar_sample(s->position, s->direction, s->normal, s->radiance, contribution,
-                                              contribution, s->pdf, bsdf, guide[at + i]);
+            batch[i] = gsd_make_scalar_sample(s->position, s->direction, s->normal, s->distance, s->radiance,
+                                              contribution, contribution, s->pdf, bsdf, guide[at + i]);
         }
         gsd_result result = gsd_record(t->stream, batch, n);
         if (result)

@@ -35,7 +35,7 @@ static int record(gsd_stream *stream, const gsd_view *view, const float at[3])
         gsd_direction(random_double() * 16777216, random_double() * 16777216, d);
     pdf = 0.5f * (gsd_pdf(view, &handle, d) + GSD_INV_4PI);
     float L = (float)(light(d) * -log(1 - random_double())); /* as noisy as a path */
-    gsd_training_sample sample = gsd_make_scalar_sample(at, d, NULL, L, L, L, pdf, GSD_INV_4PI, 0);
+    gsd_training_sample sample = gsd_make_scalar_sample(at, d, NULL, INFINITY, L, L, L, pdf, GSD_INV_4PI, 0);
     return gsd_record(stream, &sample, 1);
 }
 

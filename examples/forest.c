@@ -71,7 +71,7 @@ static float estimate(guide *g, const gkd_view *cells, const gsd_view *trees, co
     gkd_training_sample to_cells =
         gkd_make_scalar_sample(p, d, up, distance, d[2] > 0 ? L : GKD_REJECTED, value, value, pdf, pdf_bsdf, pdf_guide);
     gsd_training_sample to_trees =
-        gsd_make_scalar_sample(p, d, up, d[2] > 0 ? L : GSD_REJECTED, value, value, pdf, pdf_bsdf, pdf_guide);
+        gsd_make_scalar_sample(p, d, up, distance, d[2] > 0 ? L : GSD_REJECTED, value, value, pdf, pdf_bsdf, pdf_guide);
     g->failed |= gkd_record(g->cell_stream, &to_cells, 1) != GKD_OK;
     g->failed |= gsd_record_cells(g->forest_stream, &cell, &to_trees, 1) != GSD_OK;
     return pdf > 0 ? value / pdf : 0;

@@ -73,13 +73,14 @@ static float radiance(float p[3], int axis, float side, float weight, const gsd_
         float pdf_bsdf = fmaxf(d[axis] * side, 0) / 3.14159265f;
         float pdf = alpha < 1 ? alpha * pdf_bsdf + (1 - alpha) * pdf_guide : pdf_bsdf;
         cosine[n] = d[axis] * side;
-        vertex[n] =
-            gsd_make_scalar_sample(p, d, normal, cosine[n] > 0 ? 0 : GSD_REJECTED, 0, weight, pdf, pdf_bsdf, pdf_guide);
+        vertex[n] = gsd_make_scalar_sample(p, d, normal, INFINITY, cosine[n] > 0 ? 0 : GSD_REJECTED, 0, weight, pdf,
+                                           pdf_bsdf, pdf_guide);
         weight *= ALBEDO / 3.14159265f * cosine[n] / pdf;
         emitted[n++] = 0;
         if (!(cosine[n - 1] > 0) || !(pdf > 0)) /* into the wall */
             break;
         axis = trace(p, d, &emitted[n - 1]);
+        vertex[n - 1].nearness = fabsf(d[axis] / (p[axis] - vertex[n - 1].position[axis])); /* 1 / distance */
         side = d[axis] > 0 ? -1.0f : 1.0f;
     }
     for (int i = n - 1; i >= 0; --i) { /* back along the path: light is what arrives at vertex i from its direction */

@@ -75,8 +75,10 @@ static float radiance(float *p, float *d, const gsd_view *field, gsd_stream *str
         float pdf = alpha * pdf_bsdf + (1 - alpha) * pdf_guide; // ... and divide by the density of both.
         f_cos[count] = hit->grey / 3.14159265f * cosine;
         vertex[count++] =
-            gsd_make_scalar_sample(p, d, n, cosine > 0 ? 0 : GSD_REJECTED, 0, 0, pdf, pdf_bsdf, pdf_guide);
+            gsd_make_scalar_sample(p, d, n, INFINITY, cosine > 0 ? 0 : GSD_REJECTED, 0, 0, pdf, pdf_bsdf, pdf_guide);
         hit = cosine > 0 ? trace(p, d, n) : NULL;
+        const float *q = vertex[count - 1].position, way[3] = {p[0] - q[0], p[1] - q[1], p[2] - q[2]};
+        vertex[count - 1].nearness = cosine > 0 ? 1 / dot(d, way) : 0; // 1 / distance
     }
     float L = hit ? hit->light : 0;
     for (int i = count - 1; i >= 0 && L > 0; --i) { // 3. Back along the path: L comes from vertex[i].direction.

@@ -206,6 +206,13 @@ static float any_pdf(stress *s, const recipe *r)
     return r->pdf == 2 && stress_chance(s, 0.1) ? hostile_number(s) : (float)(1 / (4 * PI));
 }
 
+static float any_distance(stress *s, bool hostile)
+{
+    if (hostile && stress_chance(s, 0.1))
+        return hostile_number(s);
+    return stress_chance(s, 0.3) ? INFINITY : (float)stress_log(s, 1e-3, 100);
+}
+
 static bool bad_value(float x) { return !(x >= 0) || !isfinite(x) || !((double)x < 9.9e29); }
 
 static uint32_t some(stress *s, double most) { return (uint32_t)stress_log(s, 1, most); }

@@ -236,13 +236,6 @@ static gkd_desc any_desc(stress *s)
     return d;
 }
 
-static float any_distance(stress *s, bool hostile)
-{
-    if (hostile && stress_chance(s, 0.1))
-        return hostile_number(s);
-    return stress_chance(s, 0.3) ? INFINITY : (float)stress_log(s, 1e-3, 100);
-}
-
 /* Whether a sample is bad, by the words of the header's ERRORS; its direction shows as pdf_mix = 0, its distance as a
    nearness below 0 or not finite. */
 static bool bad_sample(const gkd_training_sample *t)

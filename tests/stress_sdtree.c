@@ -29,7 +29,7 @@ static double leaf_integral(const gsd_view *v, const gsd_handle *h, const place 
     double sum = 0, area = 4 * PI * pow(0.25, p->depth) / (side * side);
     for (j = 0; j < side; ++j)
         for (i = 0; i < side; ++i)
-            sum += area * (double)gsd_oriented(v, h, pdf, p->x + (i << 21), p->y + (j << 21));
+            sum += area * (double)gsd_oriented(v, h, pdf, p->x + (i << 21), p->y + (j << 21), 1);
     return sum;
 }
 
@@ -282,7 +282,8 @@ static bool bad_sample(const gsd_training_sample *t, bool forest)
             return true;
     return bad_value(t->radiance) || bad_value(t->contribution) || bad_value(t->pixel_contribution) ||
            !(t->pdf_mix > 0) || !isfinite(t->pdf_mix) || !(t->pdf_bsdf >= 0) || !isfinite(t->pdf_bsdf) ||
-           !(t->pdf_guide >= 0) || !isfinite(t->pdf_guide) || (double)t->radiance >= 9.9e29 * (double)t->pdf_mix;
+           !(t->pdf_guide >= 0) || !isfinite(t->pdf_guide) || !(t->nearness >= 0) || !isfinite(t->nearness) ||
+           (double)t->radiance >= 9.9e29 * (double)t->pdf_mix;
 }
 
 /* n samples; returns how many of them are bad. */
@@ -297,8 +298,9 @@ static uint32_t make_samples(stress *s, const recipe *r, const gsd_desc *d, gsd_
         value = any_value(s, r, dir);
         contribution = r->value == 4 ? any_value(s, r, dir) : value;
         pixel = r->value == 4 ? any_value(s, r, dir) : value;
-        t[i] = gsd_make_scalar_sample(p, dir, stress_chance(s, 0.5) ? normal : NULL, value, contribution, pixel,
-                                      any_pdf(s, r), any_pdf(s, r), stress_chance(s, 0.5) ? 0 : any_pdf(s, r));
+        t[i] = gsd_make_scalar_sample(p, dir, stress_chance(s, 0.5) ? normal : NULL, any_distance(s, r->pdf == 2),
+                                      value, contribution, pixel, any_pdf(s, r), any_pdf(s, r),
+                                      stress_chance(s, 0.5) ? 0 : any_pdf(s, r));
         bad += bad_sample(&t[i], d->forest_cells > 0);
     }
     return bad;
@@ -413,7 +415,8 @@ static void hot_leaf(stress *s)
         gsd_stats stats;
         make_samples(s, &r, gsd_get_desc(f), batch, 400);
         for (uint32_t i = 0; i < 400; ++i)
-            batch[i] = gsd_make_scalar_sample(batch[i].position, r.lamp, NULL, bright, bright, bright, 1, 1, 0);
+            batch[i] =
+                gsd_make_scalar_sample(batch[i].position, r.lamp, NULL, INFINITY, bright, bright, bright, 1, 1, 0);
         learn(s, f, stream, 400);
         gsd_get_stats(f, &stats);
         depth = stats.max_depth;

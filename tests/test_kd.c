@@ -1028,8 +1028,8 @@ static void test_split_reports_let_another_model_follow(void **state)
             float w[3];
             cell[i] = gkd_find_cell(&v, s[i].position);
             gkd_unpack_direction(s[i].direction, w);
-            g[i] = gsd_make_scalar_sample(s[i].position, w, NULL, s[i].radiance, s[i].contribution, s[i].contribution,
-                                          s[i].pdf_mix, s[i].pdf_bsdf, 0);
+            g[i] = gsd_make_scalar_sample(s[i].position, w, NULL, INFINITY, s[i].radiance, s[i].contribution,
+                                          s[i].contribution, s[i].pdf_mix, s[i].pdf_bsdf, 0);
         }
         assert_int_equal(gsd_record_cells(stream, cell, g, N), GSD_OK);
         assert_int_equal(gsd_accumulate(r.forest, &stream, 1, NULL, NULL), GSD_OK);

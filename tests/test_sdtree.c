@@ -264,9 +264,9 @@ static void test_sizes_are_as_documented(void **state)
     (void)state;
     assert_int_equal(sizeof(gsd_node), 16);
     assert_int_equal(sizeof(gsd_alias), 12);
-    assert_int_equal(sizeof(gsd_cell), 40);
-    assert_int_equal(sizeof(gsd_handle), 44);
-    assert_int_equal(sizeof(gsd_training_sample), 44);
+    assert_int_equal(sizeof(gsd_cell), 56);
+    assert_int_equal(sizeof(gsd_handle), 56);
+    assert_int_equal(sizeof(gsd_training_sample), 48);
     assert_int_equal(sizeof(gsdi_tree), 32);
     assert_true(sizeof(gsdi_state) < 600);
     assert_int_equal(sizeof(gsd_stats), 15 * 8 + 22 * 4);
@@ -1100,6 +1100,9 @@ static void test_batches_equal_single_queries_at_every_level(void **state)
             long apart = 0;
             for (uint32_t i = 0; i < N; ++i) {
                 handles[i] = gsd_find_cell(&v, i % 43); /* 40 .. 42: no such cell: uniform */
+                if (i % 5 < 2)                          /* seen from beside the pivot */
+                    for (int k = 0; k < 3; ++k)
+                        handles[i].offset[k] = 0.9f * rndf() - 0.45f;
                 u[i][0] = i == 5 ? 0 : i == 6 ? 0x1.fffffep-1f : rndf();
                 u[i][1] = i == 7 ? 0 : i == 6 ? 0x1.fffffep-1f : rndf();
                 random_direction(in[i]);
@@ -1149,6 +1152,8 @@ static void test_batches_of_oriented_handles_equal_single_queries(void **state)
             for (uint32_t i = 0; i < N; ++i) {
                 float normal[3];
                 handles[i] = gsd_find_cell(&v, i % (CELLS + 3));
+                for (int k = 0; k < 3 && i % 5 < 2; ++k)
+                    handles[i].offset[k] = 0.9f * rndf() - 0.45f;
                 some_normal((unsigned)(rng_next() % 30), normal);
                 if (rng_next() % 8 < (i / 500 % 2 ? 7 : 3)) /* now most are oriented, now few */
                     gsd_orient(&v, &handles[i], normal);
@@ -1216,7 +1221,8 @@ static void make_samples(const gsd_view *v, gsd_training_sample *s, uint32_t n)
         }
         float mix = h.alpha * pb + (1 - h.alpha) * pg;
         float L = i % 7 ? scene_radiance(p, d) : 0;
-        s[i] = gsd_make_scalar_sample(p, d, NULL, L, L * 0.3f, L * 0.3f * (0.5f + p[0]), mix, pb, pg);
+        s[i] = gsd_make_scalar_sample(p, d, NULL, i % 5 ? 0.3f + p[1] : INFINITY, L, L * 0.3f, L * 0.3f * (0.5f + p[0]),
+                                      mix, pb, pg);
     }
 }
 
@@ -1434,8 +1440,9 @@ static void test_targets_with_normals_match_a_naive_reference(void **state)
                     pg = gsd_pdf(&v, &h, dir);
                 }
                 /* every third: the renderer did not ask for the guide's density */
-                s[i] = gsd_make_scalar_sample(s[i].position, dir, i % 5 ? n : NULL, s[i].radiance, s[i].contribution,
-                                              s[i].pixel_contribution, 0.5f * (pb + pg), pb, i % 3 ? pg : 0);
+                s[i] = gsd_make_scalar_sample(s[i].position, dir, i % 5 ? n : NULL, INFINITY, s[i].radiance,
+                                              s[i].contribution, s[i].pixel_contribution, 0.5f * (pb + pg), pb,
+                                              i % 3 ? pg : 0);
                 double wide[3], alpha = pass ? (double)d.alpha : 0.5; /* pass 0 did not guide */
                 bool has = naive_normal(s[i].direction, wide);
                 assert_true(has == (i % 5 != 0));
@@ -1551,7 +1558,7 @@ static void test_smoothing_matches_a_naive_reference(void **state)
                     random_direction(dir);
                     L *= dir[2] > 0.3f ? 5 : 1;
                     L = i % 3 == 0 ? 0 : i % 31 == 1 ? GSD_REJECTED : L; /* zeros are no evidence for a shape */
-                    s[i] = gsd_make_scalar_sample(at, dir, NULL, L, L, L, 0.1f, 0.1f, 0.1f);
+                    s[i] = gsd_make_scalar_sample(at, dir, NULL, INFINITY, L, L, L, 0.1f, 0.1f, 0.1f);
                     naive_leaf(&t, ((s[i].direction[0] & 0xffffff) + 0.5) / 16777216,
                                ((s[i].direction[1] & 0xffffff) + 0.5) / 16777216, &p, &area, &id);
                     sum[id] += (double)L * (target == GSD_TARGET_RADIANCE ? 1 : (double)L) / (double)0.1f;
@@ -1822,6 +1829,7 @@ static void test_find_with_normals_equals_its_batch(void **state)
                 gsd_handle h = gsd_find(&v, position[i], normal[i], jitter ? u[i] : NULL);
                 gsd_handle plain = gsd_find(&v, position[i], NULL, jitter ? u[i] : NULL), by_hand;
                 by_hand = gsd_find_cell(&v, plain.cell);
+                gsd_offset(v.cells[plain.cell].pivot, v.cells[plain.cell].nearness, position[i], by_hand.offset);
                 assert_memory_equal(&by_hand, &plain, sizeof plain);
                 gsd_orient(&v, &by_hand, normal[i]);
                 assert_memory_equal(&by_hand, &h, sizeof h);
@@ -1858,6 +1866,7 @@ static void test_thin_wall_lit_from_one_side(void **state)
         make_samples(&v, s, 30000);
         for (int i = 0; i < 30000; ++i) { /* points on z = 0.5, both sides; light only from above */
             s[i].position[2] = 0.5f;
+            s[i].nearness = 0;
             s[i].radiance = direction_of(&s[i], 2) > 0 ? 1 : 0;
         }
         learn(f, s, 30000);
@@ -1906,8 +1915,8 @@ static void test_two_sided_cell_samples_the_side_that_is_asked_for(void **state)
                     }
                     float cosine = dir[2] * side, mix = h.alpha * pb + (1 - h.alpha) * pg;
                     float L = cosine > 0.7f ? (side > 0 ? 10 : 4) : 0.05f, g = cosine > 0 ? L * cosine : 0;
-                    s[i] = gsd_make_scalar_sample(p, dir, with ? n : NULL, cosine > 0 ? L : GSD_REJECTED, g, g, mix, pb,
-                                                  pg);
+                    s[i] = gsd_make_scalar_sample(p, dir, with ? n : NULL, INFINITY, cosine > 0 ? L : GSD_REJECTED, g,
+                                                  g, mix, pb, pg);
                 }
                 learn(f, s, N);
                 OK(gsd_refine(f, NULL, NULL, NULL));
@@ -1975,11 +1984,11 @@ static void test_bad_samples_are_refused_and_leave_no_trace(void **state)
                     break;
                 case 6:
                     dir[i / 100 % 3] = isfinite(x) ? NAN : x;
-                    s = gsd_make_scalar_sample(s.position, dir, NULL, 1, 1, 1, 1, 1, 0);
+                    s = gsd_make_scalar_sample(s.position, dir, NULL, INFINITY, 1, 1, 1, 1, 1, 0);
                     break;
                 case 7:
                     memset(dir, 0, sizeof dir);
-                    s = gsd_make_scalar_sample(s.position, dir, NULL, 1, 1, 1, 1, 1, 0);
+                    s = gsd_make_scalar_sample(s.position, dir, NULL, INFINITY, 1, 1, 1, 1, 1, 0);
                     break;
                 case 8:
                     s.position[i / 100 % 3] = isfinite(x) ? NAN : x;
@@ -2021,10 +2030,10 @@ static void test_samples_without_direction_are_refused_with_a_normal_too(void **
     enum { BAD = sizeof bad / sizeof *bad };
     gsd_training_sample s[2 * BAD + 1];
     for (unsigned i = 0; i < BAD; ++i) {
-        s[2 * i] = gsd_make_scalar_sample(p, bad[i], i % 2 ? n : NULL, 1, 1, 1, 1, 1, 0);
-        s[2 * i + 1] = gsd_make_sample(p, bad[i], n, one, one, 1, NULL, 1, 1, 0);
+        s[2 * i] = gsd_make_scalar_sample(p, bad[i], i % 2 ? n : NULL, INFINITY, 1, 1, 1, 1, 1, 0);
+        s[2 * i + 1] = gsd_make_sample(p, bad[i], n, INFINITY, one, one, 1, NULL, 1, 1, 0);
     }
-    s[2 * BAD] = gsd_make_sample(p, good, n, one, one, 1, NULL, 1, 1, 0); /* any length will do */
+    s[2 * BAD] = gsd_make_sample(p, good, n, INFINITY, one, one, 1, NULL, 1, 1, 0); /* any length will do */
     float x[3] = {0.6f, 0, 0.8f};
     uint32_t packed[2];
     assert_true(gsd_pack_direction(x, n, packed));
@@ -2052,7 +2061,7 @@ static void test_positions_outside_are_clamped_and_counted(void **state)
     gsd_field *f;
     float out[3] = {2, 0.5f, 0.5f}, dir[3] = {0, 0, 2};
     OK(gsd_create(&d, &f));
-    gsd_training_sample s = gsd_make_scalar_sample(out, dir, NULL, 1, 1, 1, 1, 1, 0);
+    gsd_training_sample s = gsd_make_scalar_sample(out, dir, NULL, INFINITY, 1, 1, 1, 1, 1, 0);
     learn(f, &s, 1);
     gsd_stats stats;
     gsd_get_stats(f, &stats);
@@ -2070,9 +2079,9 @@ static void test_rejected_and_zero_samples_count(void **state)
     float p[3] = {0.5f, 0.5f, 0.5f}, dir[3] = {0, 0, 1};
     gsd_training_sample s[3];
     OK(gsd_create(&d, &f));
-    s[0] = gsd_make_scalar_sample(p, dir, NULL, GSD_REJECTED, 5, 5, 1, 1, 0);
-    s[1] = gsd_make_scalar_sample(p, dir, NULL, 0, 0, 0, 1, 1, 0);
-    s[2] = gsd_make_scalar_sample(p, dir, NULL, 1, 1, 1, 1, 1, 0);
+    s[0] = gsd_make_scalar_sample(p, dir, NULL, INFINITY, GSD_REJECTED, 5, 5, 1, 1, 0);
+    s[1] = gsd_make_scalar_sample(p, dir, NULL, INFINITY, 0, 0, 0, 1, 1, 0);
+    s[2] = gsd_make_scalar_sample(p, dir, NULL, INFINITY, 1, 1, 1, 1, 1, 0);
     learn(f, s, 3);
     gsd_stats stats;
     gsd_get_stats(f, &stats);
@@ -2121,7 +2130,8 @@ static int scenario(counter *c)
     for (int i = 0; i < 3000; ++i) {
         float p[3] = {0.5f, 0.5f, 0.5f}, dir[3];
         random_direction(dir);
-        s[i] = gsd_make_scalar_sample(p, dir, NULL, 1, dir[0] > 0.8f ? 1 : 0.1f, 1, 0.0795775f, 0.0795775f, 0);
+        s[i] =
+            gsd_make_scalar_sample(p, dir, NULL, INFINITY, 1, dir[0] > 0.8f ? 1 : 0.1f, 1, 0.0795775f, 0.0795775f, 0);
         cells[i] = (uint32_t)i % 3;
     }
     failed += gsd_stream_create(f, &stream) != GSD_OK;
@@ -2290,7 +2300,7 @@ static void test_memory_cap_holds_while_cells_keep_an_old_tree(void **state)
                 for (int axis = 0; axis < 3; ++axis)
                     p[axis] = pass == 0 ? 0.3f : rndf() * ((pass == 2 && axis < 2) || (pass == 3 && axis) ? 0.1f : 1);
                 random_direction(direction);
-                s[k] = gsd_make_scalar_sample(p, direction, NULL, L, L, L, 0.08f, 0.08f, 0);
+                s[k] = gsd_make_scalar_sample(p, direction, NULL, INFINITY, L, L, L, 0.08f, 0.08f, 0);
             }
             learn(f, s, 20000);
             OK(gsd_refine(f, NULL, NULL, NULL));
@@ -2418,6 +2428,7 @@ static void test_gate_weighs_by_pixels(void **state)
             for (int i = 0; i < 40000; ++i) {
                 s[i].radiance = s[i].contribution = direction_of(&s[i], 0) > 0.97f ? 100 : 0.01f;
                 s[i].pixel_contribution = s[i].contribution * (dark ? 1 : 1e-4f);
+                s[i].nearness = 0;
             }
             learn(f, s, 40000);
             OK(gsd_refine(f, &info, NULL, NULL));
@@ -2488,7 +2499,7 @@ static void check_history(const gsd_desc *d, const uint32_t *sizes, int passes, 
         for (uint32_t i = 0; i < sizes[pass]; ++i) {
             float p[3] = {rndf(), rndf(), rndf()}, dir[3];
             random_direction(dir);
-            s[i] = gsd_make_scalar_sample(p, dir, NULL, 1, 1, 1, 1, 1, 1);
+            s[i] = gsd_make_scalar_sample(p, dir, NULL, INFINITY, 1, 1, 1, 1, 1, 1);
         }
         learn(f, s, sizes[pass]);
         OK(gsd_refine(f, NULL, NULL, NULL));
@@ -2697,7 +2708,7 @@ static void test_forest_split_export_and_import(void **state)
     for (int i = 0; i < 500; ++i) {
         float p[3] = {0, 0, 0}, d[3];
         random_direction(d);
-        s[i] = gsd_make_scalar_sample(p, d, NULL, 1 + 10 * (d[0] > 0.5f), 1, 1, 0.0795775f, 0.0795775f, 0);
+        s[i] = gsd_make_scalar_sample(p, d, NULL, INFINITY, 1 + 10 * (d[0] > 0.5f), 1, 1, 0.0795775f, 0.0795775f, 0);
         cells[i] = 7;
     }
     cells[0] = 8; /* no such cell: refused */

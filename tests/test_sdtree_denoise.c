@@ -293,7 +293,7 @@ static double trained(int kind, int n, gsd_target target, bool denoise, uint64_t
             }
             mix = 0.5f * (p + GSD_INV_4PI);
             float L = (float)(light(kind, w) * -log(1 - rnd()));
-            gsd_training_sample sample = gsd_make_scalar_sample(at, w, NULL, L, L, L, mix, GSD_INV_4PI, p);
+            gsd_training_sample sample = gsd_make_scalar_sample(at, w, NULL, INFINITY, L, L, L, mix, GSD_INV_4PI, p);
             OK(gsd_record(s, &sample, 1));
         }
         OK(gsd_accumulate(f, &s, 1, NULL, NULL));
@@ -353,7 +353,8 @@ static void record_box(gsd_stream *s, int n)
         float at[3] = {(float)rnd(), (float)rnd(), (float)rnd()}, w[3];
         gsd_direction(rnd() * 16777216, rnd() * 16777216, w);
         float L = (float)(light(i % 2, w) * rnd());
-        gsd_training_sample sample = gsd_make_scalar_sample(at, w, NULL, L, L, L, GSD_INV_4PI, GSD_INV_4PI, 0);
+        gsd_training_sample sample =
+            gsd_make_scalar_sample(at, w, NULL, INFINITY, L, L, L, GSD_INV_4PI, GSD_INV_4PI, 0);
         OK(gsd_record(s, &sample, 1));
     }
 }
@@ -452,7 +453,8 @@ static void test_blur_adds_leaves(void **state)
         for (int i = 0; i < 2000; ++i) {
             gsd_direction(rnd() * 16777216, rnd() * 16777216, w);
             float L = (float)(light(0, w) * -log(1 - rnd()));
-            gsd_training_sample sample = gsd_make_scalar_sample(at, w, NULL, L, L, L, GSD_INV_4PI, GSD_INV_4PI, 0);
+            gsd_training_sample sample =
+                gsd_make_scalar_sample(at, w, NULL, INFINITY, L, L, L, GSD_INV_4PI, GSD_INV_4PI, 0);
             OK(gsd_record(s, &sample, 1));
         }
         OK(gsd_accumulate(f, &s, 1, NULL, NULL));
@@ -540,7 +542,7 @@ static void test_pass_says_otherwise(void **state)
         OK(gsd_stream_create(f, &s));
         for (int i = 0; i < 5000; ++i) {
             at[0] = (float)rnd();
-            sample = gsd_make_scalar_sample(at, up, NULL, 1, 1, 1, GSD_INV_4PI, GSD_INV_4PI, 0);
+            sample = gsd_make_scalar_sample(at, up, NULL, INFINITY, 1, 1, 1, GSD_INV_4PI, GSD_INV_4PI, 0);
             OK(gsd_record(s, &sample, 1));
         }
         OK(gsd_accumulate(f, &s, 1, NULL, NULL));

@@ -6,9 +6,10 @@
    gate=on|off, gate_margin, gate_gain, gate_probe, guide_weight=on|off, history=on|off, denoise=on|off|gaussian,
    denoise_budget, denoise_when=training|last (in every refine, or only in that which ends --train); of
    denoise=gaussian: sigma, gaussian_rho, gaussian_sphere=off|on, gaussian_limit=on|off; uniform, alias=on|off,
-   simd=scalar|avx2|avx512|neon, product=on|off (with the cosine), jitter=on|off (find looks up a jittered position),
-   sparse=on|off (closed fields record only some tiles). With --train: save=FILE writes the field when the training
-   ends; compare=FILE,FILE,... judges such fields by the samples of the picture, see >>rivals. */
+   simd=scalar|avx2|avx512|neon, product=on|off (with the cosine), parallax=on|off (cells know distances), jitter=on|off
+   (find looks up a jittered position), sparse=on|off (closed fields record only some tiles). With --train: save=FILE
+   writes the field when the training ends; compare=FILE,FILE,... judges such fields by the samples of the picture, see
+   >>rivals. */
 #include "method_options.h"
 #include "threads.h"
 
@@ -27,7 +28,7 @@ typedef struct sdtree {
     gsd_view view;
     gsd_stream **streams;
     int tiles;
-    bool product, jitter, sparse, denoise_last, frozen;
+    bool product, parallax, jitter, sparse, denoise_last, frozen;
     float fraction; /* of the tiles that record in this pass */
     int pass;
     uint64_t stream_peak;
@@ -80,6 +81,7 @@ static bool parse(parser *p, gsd_desc *d, sdtree *m)
     d->alias = choice(p, "alias", "off|on") == 1;
     d->simd = (gsd_simd)(choice(p, "simd", "scalar|avx2|avx512|neon") + 1);
     m->product = choice(p, "product", "off|on") != 0;
+    m->parallax = choice(p, "parallax", "off|on") != 0;
     m->jitter = choice(p, "jitter", "off|on") == 1;
     m->sparse = choice(p, "sparse", "off|on") != 0;
     return p->ok;
@@ -285,11 +287,13 @@ static gsd_training_sample convert(const sdtree *m, const tr_vertex *v)
     memcpy(L, &v->L, sizeof L);
     memcpy(f, &v->f, sizeof f);
     memcpy(w, &v->pixel_weight, sizeof w);
-    gsd_training_sample s = gsd_make_sample(p, d, m->product && !(v->flags & TR_VERTEX_PASSES) ? n : NULL, L, f,
-                                            v->cosine, w, v->pdf_mix, v->pdf_bsdf, v->pdf_guide);
+    gsd_training_sample s = gsd_make_sample(p, d, m->product && !(v->flags & TR_VERTEX_PASSES) ? n : NULL,
+                                            m->parallax ? v->distance : INFINITY, L, f, v->cosine, w, v->pdf_mix,
+                                            v->pdf_bsdf, v->pdf_guide);
     if (v->flags & TR_VERTEX_REJECTED) {
         s.radiance = GSD_REJECTED;
         s.contribution = s.pixel_contribution = 0;
+        s.nearness = 0; /* nothing was traced */
     }
     return s;
 }
