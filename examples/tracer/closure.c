@@ -180,9 +180,8 @@ static bool sample_roughdielectric(const tr_closure *c, vec3 m, float u_lobe, ve
     return wi->z < 0;
 }
 
-/* Any type but the diffuse one. */
-static TR_NOINLINE bool sample_lobes(const tr_closure *c, float u_lobe, float u1, float u2, vec3 *wi, vec3 *f,
-                                     float *pdf)
+/* A local direction from the smooth part, where it is not the diffuse type. */
+static inline bool sample_local(const tr_closure *c, float u_lobe, float u1, float u2, vec3 *wi)
 {
     vec3 local, m;
     switch (c->type) {
@@ -210,6 +209,17 @@ static TR_NOINLINE bool sample_lobes(const tr_closure *c, float u_lobe, float u1
     default:
         return false;
     }
+    *wi = local;
+    return true;
+}
+
+/* Any type but the diffuse one. */
+static TR_NOINLINE bool sample_lobes(const tr_closure *c, float u_lobe, float u1, float u2, vec3 *wi, vec3 *f,
+                                     float *pdf)
+{
+    vec3 local;
+    if (!sample_local(c, u_lobe, u1, u2, &local))
+        return false;
     *wi = to_world(&c->frame, local);
     *f = eval_local(c, local, pdf);
     if (blocked(c, *wi, local.z))
@@ -229,4 +239,45 @@ bool tr_closure_sample(const tr_closure *closure, float u_lobe, float u1, float 
     *f = blocked(c, *wi, local.z) ? v3s(0) : scale3(c->diffuse, TR_INV_PI);
     *pdf = local.z * TR_INV_PI;
     return local.z > 0;
+}
+
+/* f on the way back times the cosine, over the density of `to`; eval_local has from and to the other way round, which
+   differs by the square of the index where light refracts (Veach 1997, 5.2). */
+static bool sample_adjoint_smooth(const tr_closure *c, const float u[4], vec3 *to, vec3 *weight)
+{
+    vec3 local;
+    float pdf;
+    if (c->type == TR_BSDF_DIFFUSE)
+        local = sample_cosine_hemisphere(u[2], u[3]);
+    else if (!sample_local(c, u[1], u[2], u[3], &local))
+        return false;
+    vec3 f = eval_local(c, local, &pdf);
+    float scale = local.z < 0 ? c->ior * c->ior : 1;
+    *to = to_world(&c->frame, local);
+    *weight = scale3(f, scale * fabsf(local.z) / ((1 - c->delta_probability) * pdf));
+    return pdf > 0;
+}
+
+bool tr_closure_sample_adjoint(const tr_closure *closure, vec3 ng, const float u[4], vec3 *to, vec3 *weight,
+                               bool *delta)
+{
+    const tr_closure *c = closure;
+    vec3 from = to_world(&c->frame, c->wo);
+    *delta = u[0] < c->delta_probability;
+    if (*delta) {
+        float eta_scale = 1;
+        bool gap;
+        if (!tr_closure_draw_delta(c, u[1], to, weight, &eta_scale, &gap))
+            return false;
+        *weight = scale3(*weight, eta_scale / c->delta_probability);
+        if (gap) /* no surface is there */
+            return true;
+    } else if (c->delta_probability >= 1 || !sample_adjoint_smooth(c, u, to, weight)) {
+        return false;
+    }
+    if (blocked(c, from, c->wo.z))
+        return false;
+    float in = fabsf(c->wo.z) / fabsf(dot3(ng, from)), out = fabsf(dot3(ng, *to)) / fabsf(dot3(c->frame.n, *to));
+    *weight = scale3(*weight, in * out);
+    return !black3(*weight);
 }
