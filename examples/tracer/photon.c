@@ -97,8 +97,10 @@ static void arrive(photon_worker *w, const tr_scene *scene, tr_photon_stats *sta
             tr_surface_prefetch(scene, &w->hits[w->active[i + 16]], 0);
         if (i + 8 < w->active_count)
             tr_surface_prefetch(scene, &w->hits[w->active[i + 8]], 1);
-        if (w->hits[id].hit.geomID == RTC_INVALID_GEOMETRY_ID)
+        if (w->hits[id].hit.geomID == RTC_INVALID_GEOMETRY_ID) {
+            add_flux(stats->escaped, w->paths[id].flux);
             continue;
+        }
         tr_surface_from_hit_lean(scene, &w->hits[id], &w->surfaces[id]);
         tr_closure_prefetch(scene, &w->surfaces[id]);
         w->paths[id].distance += w->surfaces[id].t;
@@ -108,8 +110,6 @@ static void arrive(photon_worker *w, const tr_scene *scene, tr_photon_stats *sta
         int id = w->active[i];
         if (tr_closure_prepare(scene, &w->surfaces[id], neg3(w->paths[id].direction), &w->closures[id]))
             w->active[kept++] = id;
-        else
-            add_flux(stats->absorbed, w->paths[id].flux);
     }
     w->active_count = kept;
 }
@@ -187,13 +187,8 @@ static void scatter(photon_worker *w, const tr_scene *scene, tr_photon_stats *st
     int kept = 0;
     for (int i = 0; i < w->active_count; ++i) {
         int id = w->active[i];
-        vec3 arrived = w->paths[id].flux;
-        bool goes_on = scatter_path(w, scene, id, stats);
-        if (goes_on) {
+        if (scatter_path(w, scene, id, stats))
             w->active[kept++] = id;
-            arrived = sub3(arrived, w->paths[id].flux);
-        }
-        add_flux(stats->absorbed, arrived);
     }
     w->active_count = kept;
 }
@@ -266,7 +261,7 @@ bool tr_trace_photons(const tr_photon_pass *pass, tr_photon_fn take, void *user,
         stats->bad += s->bad;
         for (int c = 0; c < 3; ++c) {
             stats->emitted[c] += s->emitted[c];
-            stats->absorbed[c] += s->absorbed[c];
+            stats->escaped[c] += s->escaped[c];
         }
     }
     free(job.tiles);

@@ -491,9 +491,8 @@ typedef struct tr_photon_pass {
 
 typedef struct tr_photon_stats {
     uint64_t paths, photons, rays;
-    uint64_t bad;       /* dropped: weights that are NaN or infinite */
-    double emitted[3];  /* W, of these paths over `total` */
-    double absorbed[3]; /* W: what neither left the scene nor was cut off at max_depth */
+    uint64_t bad;                  /* dropped: weights that are NaN or infinite */
+    double emitted[3], escaped[3]; /* W: that these paths began with; of it and what was reflected, what met nothing */
 } tr_photon_stats;
 
 #define TR_PHOTON_TILE 2048 /* paths of a tile; its photons come in one order, whatever the threads */
