@@ -163,7 +163,7 @@ static bool scatter_path(photon_worker *w, const tr_scene *scene, int id, tr_pho
     bool delta;
     rng_float2(&p->rng, &u[0], &u[1]);
     rng_float2(&p->rng, &u[2], &u[3]);
-    if (!tr_closure_sample_adjoint(&w->closures[id], s->ng, u, &to, &weight, &delta))
+    if (!tr_closure_sample_adjoint(scene, s, &w->closures[id], u, &to, &weight, &delta))
         return false;
     p->flux = mul3(p->flux, weight);
     if (!finite3(p->flux) || !finite3(to)) {

@@ -388,8 +388,8 @@ vec3 tr_closure_albedo(const tr_closure *closure); /* approximate, for the albed
    smooth part, and the share of flux that goes there over its probability. The adjoint of what camera paths see (Veach
    1997, 5.2 and 5.3): nothing gathers in the denser side, and a shading normal ns beside the geometric one ng counts
    as |wo.ns to.ng| / (|wo.ng to.ns|). u in [0,1)^4. False = absorbed. */
-bool tr_closure_sample_adjoint(const tr_closure *closure, vec3 ng, const float u[4], vec3 *to, vec3 *weight,
-                               bool *delta);
+bool tr_closure_sample_adjoint(const tr_scene *scene, const tr_surface *surface, const tr_closure *closure,
+                               const float u[4], vec3 *to, vec3 *weight, bool *delta);
 
 /* ---- >>lightquery ------------------------------------------------------------------------------------------- */
 
