@@ -259,6 +259,9 @@ static void agree(const char *what, tr_scene *s, receiver r, uint32_t paths, int
 
 static const vec3 WARM = {3, 2, 0.5f};
 
+/* A speck, too small to shade anything, for a bounding box with sides. */
+static void add_speck(tr_scene *s) { add_sphere(s, GRAY, v3(1.5f, 2.5f, -2), 1e-3f); }
+
 /* Direct light alone: two edges. */
 static void check_direct(const char *what, tr_scene *s, double half, bool disk, uint32_t paths, estimate expected)
 {
@@ -406,6 +409,7 @@ static void directional_light_shines_on_a_square(void **state)
     (void)state;
     tr_scene *s = scene_new();
     add_floor(s, 1);
+    add_speck(s);
     add_light(s, TR_LIGHT_DIRECTIONAL, WARM)->direction = v3(1, -2, 0.5f);
     check_direct("directional", s, 1, false, 1 << 15, exactly(WARM, 4 * 2 / sqrt(5.25)));
 }
@@ -416,6 +420,7 @@ static void sun_shines_on_a_square(void **state)
     for (int wide = 0; wide < 2; ++wide) {
         tr_scene *s = scene_new();
         add_floor(s, 1);
+        add_speck(s);
         tr_light *l = add_light(s, TR_LIGHT_SUN, WARM);
         l->direction = v3(1, -2, 0.5f);
         l->cutoff_cos = wide ? 0.9f : (float)cos(0.005); /* the wide one still stays above the horizon */
@@ -429,6 +434,7 @@ static void constant_light_shines_on_a_square(void **state)
     (void)state;
     tr_scene *s = scene_new();
     add_floor(s, 1);
+    add_speck(s);
     add_light(s, TR_LIGHT_CONSTANT, WARM);
     check_direct("constant", s, 1, false, 1 << 15, exactly(WARM, 4 * PI));
 }
@@ -466,6 +472,7 @@ static void envmap_shines_on_a_square(void **state)
     for (int squeezed = 0; squeezed < 2; ++squeezed) {
         tr_scene *s = scene_new();
         add_floor(s, 1);
+        add_speck(s);
         tr_light *l = add_envmap(s, 7);
         if (squeezed) {
             l->to_world = placed(v3s(0), v3(1, 2, 3), 50, v3(1, 2, 0.7f));
@@ -483,6 +490,7 @@ static void sunsky_shines_on_a_square(void **state)
     (void)state;
     tr_scene *s = scene_new();
     add_floor(s, 1);
+    add_speck(s);
     int sky = tr_scene_add_light(s, TR_LIGHT_ENVMAP), sun = tr_scene_add_light(s, TR_LIGHT_SUN);
     tr_sunsky desc = {.turbidity = 3,
                       .sun_direction = norm3(v3(1, 1, 0.5f)),
@@ -527,14 +535,18 @@ static void lights_emit_their_power(void **state)
     sun->cutoff_cos = 0.999f;
     add_point(s, v3s(0), v3s(0)); /* black */
     scene_done(s);
-    double shown = PI * (double)s->bounds_radius * s->bounds_radius, c = 30 * PI / 180, b = 10 * PI / 180;
+    /* Distant lights shine through the bounding box: 3 x 3 across, 2 high. A convex body's mean shadow is a quarter of
+       its surface (Cauchy). The sun's cone is narrow: the sides add half the mean sine of its directions. */
+    double c = 30 * PI / 180, b = 10 * PI / 180, sun_cos = 0.999, alpha = acos(sun_cos);
+    double sun_shadow = 9 * 0.5 * (1 - sun_cos * sun_cos) +
+                        2 * 6 * 2 / PI * 0.5 * (alpha - sin(alpha) * cos(alpha)); /* integral over cosine, /2 pi */
     double factor[8] = {PI * PI * 2.25,
                         4 * PI * PI * 0.25,
                         4 * PI,
                         2 * PI * (1 - (sin(c) - sin(b)) / (c - b)), /* the falloff over the cone, by parts */
-                        shown,
-                        4 * PI * shown,
-                        2 * PI * (1 - 0.999) * shown,
+                        9,
+                        PI * (2 * 9 + 4 * 6),
+                        2 * PI * sun_shadow,
                         0};
     enum { N = 1 << 20 };
     double sum[8][3] = {{0}}, squares[8][3] = {{0}};

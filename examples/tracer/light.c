@@ -223,6 +223,28 @@ static double light_power(const tr_scene *scene, const tr_light *light, double e
     return 0;
 }
 
+/* Area of the shadow that the scene's bounding box casts along d, and of each of the three pairs of faces in it. */
+static float box_shadow(const tr_scene *scene, vec3 d, float face[3])
+{
+    vec3 e = sub3(scene->bounds_max, scene->bounds_min);
+    face[0] = e.y * e.z * fabsf(d.x);
+    face[1] = e.z * e.x * fabsf(d.y);
+    face[2] = e.x * e.y * fabsf(d.z);
+    return face[0] + face[1] + face[2];
+}
+
+/* Share of what light_power counts that photons carry: they start from the box, which is smaller than its sphere. */
+static double photon_share(const tr_scene *scene, const tr_light *light)
+{
+    const double disk = 3.14159265358979323846 * bounds_radius(scene) * bounds_radius(scene);
+    float face[3];
+    if (light->type == TR_LIGHT_DIRECTIONAL || light->type == TR_LIGHT_SUN)
+        return box_shadow(scene, light->direction, face) / disk;
+    if (light->type == TR_LIGHT_ENVMAP || light->type == TR_LIGHT_CONSTANT)
+        return 0.5 * box_shadow(scene, v3s(1), face) / disk; /* a convex body's mean shadow: surface / 4 (Cauchy) */
+    return 1;
+}
+
 /* Switch off what cannot be sampled, saying so. A light that is merely black says nothing. */
 static bool light_usable(const tr_scene *scene, tr_light *light, tr_log *log)
 {
@@ -244,7 +266,7 @@ static bool light_usable(const tr_scene *scene, tr_light *light, tr_log *log)
     return !reason;
 }
 
-static void select_lights(tr_scene *scene, double *power)
+static void select_lights(tr_scene *scene, double *power, const double *photon_power)
 {
     uint32_t n = (uint32_t)scene->light_count;
     double total = 0;
@@ -255,7 +277,7 @@ static void select_lights(tr_scene *scene, double *power)
     }
     scene->light_cdf[0] = scene->power_cdf[0] = 0;
     if (n)
-        cdf_build(scene->power_cdf, power, n);
+        cdf_build(scene->power_cdf, photon_power, n);
     for (uint32_t i = 0; i < n; ++i)
         if (power[i] > 0)
             power[i] = (1 - UNIFORM_SHARE) * power[i] / total + UNIFORM_SHARE / lit;
@@ -274,7 +296,7 @@ bool tr_lights_finish(tr_scene *scene, tr_log *log)
     scene->environment = malloc((n + 1) * sizeof(int));
     scene->light_cdf = malloc(2 * (n + 1) * sizeof(float));
     scene->power_cdf = scene->light_cdf ? scene->light_cdf + n + 1 : NULL;
-    double *power = malloc((n + 1) * sizeof(double));
+    double *power = malloc(2 * (n + 1) * sizeof(double)), *photon_power = power + n + 1;
     bool ok = scene->environment && scene->light_cdf && power;
     for (size_t i = 0; ok && i < n; ++i) {
         tr_light *light = &scene->lights[i];
@@ -291,9 +313,12 @@ bool tr_lights_finish(tr_scene *scene, tr_log *log)
         power[i] = light_usable(scene, light, log) ? light_power(scene, light, integral) : 0;
         if (!(power[i] > 0) || isinf(power[i]))
             power[i] = 0;
+        photon_power[i] = power[i] > 0 ? power[i] * photon_share(scene, light) : 0;
+        if (!isfinite(photon_power[i]))
+            photon_power[i] = 0;
     }
     if (ok)
-        select_lights(scene, power);
+        select_lights(scene, power, photon_power);
     else
         tr_message(log, TR_ERROR, scene->path, 0, "out of memory for the light tables");
     free(power);
@@ -614,11 +639,28 @@ static float emit_point(const tr_light *light, const float u[5], tr_emission *ou
     return spot_falloff(light, dot3(out->direction, light->direction)) / cone_pdf(width);
 }
 
-/* From a light without a place, parallel through the disk that the bounding sphere shows to the direction drawn. *value
-   is radiance, of a directional light irradiance. Returns flux over that. */
+/* Where light from wi enters the bounding box, drawn evenly from the shadow that it casts; then back, out of the scene.
+   Returns the shadow's area. */
+static float enter_box(const tr_scene *scene, vec3 wi, float u1, float u2, vec3 *p)
+{
+    float face[3], area = box_shadow(scene, wi, face), at[3], x = u1 * area;
+    const float lo[3] = {scene->bounds_min.x, scene->bounds_min.y, scene->bounds_min.z};
+    const float hi[3] = {scene->bounds_max.x, scene->bounds_max.y, scene->bounds_max.z};
+    const float d[3] = {wi.x, wi.y, wi.z};
+    int k = x < face[0] ? 0 : x < face[0] + face[1] || !(face[2] > 0) ? 1 : 2;
+    x = (k == 0 ? x : k == 1 ? x - face[0] : x - face[0] - face[1]) / face[k];
+    at[k] = d[k] > 0 ? hi[k] : lo[k];
+    at[(k + 1) % 3] = lerpf(lo[(k + 1) % 3], hi[(k + 1) % 3], clampf(x, 0, 1));
+    at[(k + 2) % 3] = lerpf(lo[(k + 2) % 3], hi[(k + 2) % 3], u2);
+    *p = madd3(v3(at[0], at[1], at[2]), wi, (float)bounds_radius(scene));
+    return area;
+}
+
+/* From a light without a place, parallel. *value is radiance, of a directional light irradiance. Returns flux over
+   that. */
 static float emit_distant(const tr_scene *scene, const tr_light *light, const float u[5], vec3 *value, tr_emission *out)
 {
-    float radius = (float)bounds_radius(scene), pdf = 1, sine, cosine;
+    float pdf = 1;
     out->distant = true;
     vec3 wi = neg3(light->direction);
     if (light->type == TR_LIGHT_ENVMAP) {
@@ -634,12 +676,8 @@ static float emit_distant(const tr_scene *scene, const tr_light *light, const fl
     } else {
         out->delta = true;
     }
-    frame3 f = frame_from_normal(wi);
-    float r = radius * sqrtf(u[1]);
-    sincos_turn(u[2], &sine, &cosine);
-    out->p = add3(scene->bounds_center, to_world(&f, v3(r * cosine, r * sine, radius)));
     out->direction = neg3(wi);
-    return pdf > 0 ? TR_PI * radius * radius / pdf : 0;
+    return pdf > 0 ? enter_box(scene, wi, u[1], u[2], &out->p) / pdf : 0;
 }
 
 bool tr_light_emit(const tr_scene *scene, const float u[5], tr_emission *emission)
