@@ -544,28 +544,34 @@ static vec3 sample_child_delta(const tr_closure *c, float u, vec3 *weight, float
     }
 }
 
+bool tr_closure_draw_delta(const tr_closure *closure, float u, vec3 *wi, vec3 *weight, float *eta_scale, bool *gap)
+{
+    const tr_closure *c = closure;
+    float share_of_gap = c->gap_probability;
+    *eta_scale = 1;
+    *gap = u < share_of_gap;
+    if (!(c->delta_probability > 0))
+        return false;
+    if (*gap) {
+        *wi = neg3(to_world(&c->frame, c->wo));
+        *weight = v3s((1 - c->opacity) / share_of_gap);
+        return c->opacity < 1;
+    }
+    if (share_of_gap > 0)
+        u = (u - share_of_gap) / (1 - share_of_gap);
+    *wi = norm3(to_world(&c->frame, sample_child_delta(c, u, weight, eta_scale)));
+    if (share_of_gap > 0)
+        *weight = scale3(*weight, 1 / (1 - share_of_gap));
+    return max3(*weight) > 0;
+}
+
 bool tr_closure_sample_delta(const tr_closure *closure, float u, vec3 *wi, vec3 *weight, float *eta_scale)
 {
     const tr_closure *c = closure;
-    *eta_scale = 1;
-    if (!(c->delta_probability > 0))
+    bool gap;
+    if (!tr_closure_draw_delta(c, u, wi, weight, eta_scale, &gap))
         return false;
-    float gap = c->gap_probability;
-    if (gap > 0) {
-        if (u < gap) {
-            *wi = neg3(to_world(&c->frame, c->wo));
-            *weight = v3s((1 - c->opacity) / gap);
-            return c->opacity < 1;
-        }
-        u = (u - gap) / (1 - gap);
-    }
-    vec3 local = sample_child_delta(c, u, weight, eta_scale);
-    *wi = norm3(to_world(&c->frame, local));
-    if (gap > 0)
-        *weight = scale3(*weight, 1 / (1 - gap));
-    if (c->bumped && dot3(c->base_n, *wi) * local.z <= 0)
-        return false;
-    return max3(*weight) > 0;
+    return gap || !c->bumped || dot3(c->base_n, *wi) * dot3(c->frame.n, *wi) > 0;
 }
 
 /* ---- albedo --------------------------------------------------------------------------------------------------- */

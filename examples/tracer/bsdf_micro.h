@@ -10,6 +10,9 @@
 
 #define TR_ALPHA_MIN 1e-3f
 
+/* tr_closure_sample_delta without its test of what a bump map blocks. *gap: straight through a mask. */
+bool tr_closure_draw_delta(const tr_closure *closure, float u, vec3 *wi, vec3 *weight, float *eta_scale, bool *gap);
+
 /* Unpolarised reflectance between dielectrics (Fresnel; Born & Wolf 1999, 1.5.2), from both cosines, >= 0 and not both
    0; eta = index of the far side over that of the near side. */
 static inline float tr_fresnel_cosines(float cos_i, float cos_t, float eta)

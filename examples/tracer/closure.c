@@ -180,9 +180,8 @@ static bool sample_roughdielectric(const tr_closure *c, vec3 m, float u_lobe, ve
     return wi->z < 0;
 }
 
-/* Any type but the diffuse one. */
-static TR_NOINLINE bool sample_lobes(const tr_closure *c, float u_lobe, float u1, float u2, vec3 *wi, vec3 *f,
-                                     float *pdf)
+/* A local direction from the smooth part, where it is not the diffuse type. */
+static inline bool sample_local(const tr_closure *c, float u_lobe, float u1, float u2, vec3 *wi)
 {
     vec3 local, m;
     switch (c->type) {
@@ -210,6 +209,17 @@ static TR_NOINLINE bool sample_lobes(const tr_closure *c, float u_lobe, float u1
     default:
         return false;
     }
+    *wi = local;
+    return true;
+}
+
+/* Any type but the diffuse one. */
+static TR_NOINLINE bool sample_lobes(const tr_closure *c, float u_lobe, float u1, float u2, vec3 *wi, vec3 *f,
+                                     float *pdf)
+{
+    vec3 local;
+    if (!sample_local(c, u_lobe, u1, u2, &local))
+        return false;
     *wi = to_world(&c->frame, local);
     *f = eval_local(c, local, pdf);
     if (blocked(c, *wi, local.z))
@@ -229,4 +239,76 @@ bool tr_closure_sample(const tr_closure *closure, float u_lobe, float u1, float 
     *f = blocked(c, *wi, local.z) ? v3s(0) : scale3(c->diffuse, TR_INV_PI);
     *pdf = local.z * TR_INV_PI;
     return local.z > 0;
+}
+
+/* The closure that a camera path has which comes along `to`. A bump map makes it another one than that for `from` where
+   the bumped and the real surface disagree on the side of a direction. */
+static TR_NOINLINE bool prepare_way_back(const tr_scene *scene, const tr_surface *s, const tr_closure *c, vec3 to,
+                                         bool delta, tr_closure *back)
+{
+    if (!tr_closure_prepare(scene, s, to, back))
+        return false;
+    /* Mirrors and glass: the same normal, or it leads elsewhere. */
+    float turned = dot3(back->frame.n, c->frame.n), crosses = dot3(c->frame.n, to);
+    return !delta || (fabsf(turned) > 0.9999f && turned * crosses > 0);
+}
+
+/* f on the way back times both cosines, over the density of `to`. eval_local has from and to the other way round, which
+   differs by the square of the index where light refracts (Veach 1997, 5.2). */
+static bool sample_adjoint_smooth(const tr_scene *scene, const tr_surface *s, const tr_closure *c, const float u[4],
+                                  vec3 from, vec3 *to, vec3 *weight)
+{
+    vec3 local;
+    float pdf, cosine = c->wo.z;
+    if (c->type == TR_BSDF_DIFFUSE)
+        local = sample_cosine_hemisphere(u[2], u[3]);
+    else if (!sample_local(c, u[1], u[2], u[3], &local))
+        return false;
+    vec3 f = eval_local(c, local, &pdf);
+    *to = to_world(&c->frame, local);
+    if (local.z < 0)
+        f = scale3(f, c->ior * c->ior);
+    if (c->bumped) {
+        tr_closure back;
+        if (!prepare_way_back(scene, s, c, *to, false, &back))
+            return false;
+        f = tr_closure_eval(&back, from, NULL);
+        cosine = dot3(back.frame.n, from);
+    }
+    *weight = scale3(f, fabsf(cosine * dot3(s->ng, *to)) / ((1 - c->delta_probability) * pdf));
+    return pdf > 0;
+}
+
+static bool sample_adjoint_delta(const tr_scene *scene, const tr_surface *s, const tr_closure *c, float u, vec3 from,
+                                 vec3 *to, vec3 *weight)
+{
+    float eta_scale = 1, scale;
+    bool gap;
+    if (!tr_closure_draw_delta(c, u, to, weight, &eta_scale, &gap))
+        return false;
+    if (gap) { /* no surface is there */
+        scale = fabsf(dot3(s->ng, from));
+    } else {
+        scale = eta_scale * fabsf(c->wo.z * dot3(s->ng, *to) / dot3(c->frame.n, *to));
+        tr_closure back;
+        if (c->bumped &&
+            (!prepare_way_back(scene, s, c, *to, true, &back) || blocked(&back, from, dot3(back.frame.n, from))))
+            return false;
+    }
+    *weight = scale3(*weight, scale / c->delta_probability);
+    return true;
+}
+
+bool tr_closure_sample_adjoint(const tr_scene *scene, const tr_surface *surface, const tr_closure *closure,
+                               const float u[4], vec3 *to, vec3 *weight, bool *delta)
+{
+    const tr_closure *c = closure;
+    vec3 from = to_world(&c->frame, c->wo);
+    *delta = u[0] < c->delta_probability;
+    bool drawn = *delta ? sample_adjoint_delta(scene, surface, c, u[1], from, to, weight)
+                        : c->delta_probability < 1 && sample_adjoint_smooth(scene, surface, c, u, from, to, weight);
+    if (!drawn)
+        return false;
+    *weight = scale3(*weight, 1 / fabsf(dot3(surface->ng, from)));
+    return !black3(*weight);
 }

@@ -15,10 +15,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-#if defined(__SSE2__)
-#include <immintrin.h>
-#endif
-
 /* A path between bounces. */
 typedef struct path {
     tr_rng rng, guide_rng;
@@ -226,37 +222,13 @@ static void start_paths(tr_worker *w, const tr_frame *frame, int tile, int sampl
 
 /* ---- >>intersect -------------------------------------------------------------------------------------------- */
 
-static void set_ray(struct RTCRay *ray, vec3 o, vec3 d, float far)
-{
-    ray->org_x = o.x;
-    ray->org_y = o.y;
-    ray->org_z = o.z;
-    ray->tnear = 0;
-    ray->dir_x = d.x;
-    ray->dir_y = d.y;
-    ray->dir_z = d.z;
-    ray->time = 0;
-    ray->tfar = far;
-    ray->mask = 0xffffffffu;
-    ray->id = 0;
-    ray->flags = 0;
-}
-
-/* Leave the surface on the side of w, by a step that covers rounding of the hit point. */
-static vec3 leave_surface(const tr_scene *scene, const tr_surface *s, vec3 w)
-{
-    float size = max3(v3(fabsf(s->p.x), fabsf(s->p.y), fabsf(s->p.z)));
-    float step = 2e-5f * tr_max(size, 0.01f * scene->bounds_radius);
-    return madd3(s->p, s->ng, dot3(s->ng, w) < 0 ? -step : step);
-}
-
 static void trace_paths(tr_worker *w, const tr_frame *frame)
 {
     double start = tr_wall_seconds();
     for (int i = 0; i < w->active_count; ++i) {
         const path *p = &w->paths[w->active[i]];
         struct RTCRayHit *hit = &w->hits[w->active[i]];
-        set_ray(&hit->ray, p->origin, p->direction, INFINITY);
+        tr_set_ray(&hit->ray, p->origin, p->direction, INFINITY);
         hit->hit.geomID = RTC_INVALID_GEOMETRY_ID;
         hit->hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
         tr_rtc_intersect(frame->scene->rtc, hit);
@@ -472,11 +444,11 @@ static void next_event(tr_worker *w, const tr_frame *frame, bool recording)
         const tr_light_sample *l = &w->lights[k];
         const tr_surface *s = &w->surfaces[w->smooth[k]];
         struct RTCRay ray;
-        vec3 origin = leave_surface(frame->scene, s, l->wi);
+        vec3 origin = tr_leave_surface(frame->scene, s->p, s->ng, l->wi);
         if (isinf(l->distance))
-            set_ray(&ray, origin, l->wi, INFINITY);
+            tr_set_ray(&ray, origin, l->wi, INFINITY);
         else /* to the sampled point: along wi from the shifted origin a curved light would shade itself */
-            set_ray(&ray, origin, sub3(madd3(s->p, l->wi, l->distance), origin), 1 - 1e-4f);
+            tr_set_ray(&ray, origin, sub3(madd3(s->p, l->wi, l->distance), origin), 1 - 1e-4f);
         w->lit[visible] = k;
         visible += !tr_rtc_occluded(frame->scene->rtc, &ray);
     }
@@ -780,7 +752,7 @@ static inline bool follow(tr_worker *w, const tr_frame *frame, int id, const cho
     p->seen |= ch->kind != CHOICE_DELTA;
     p->pdf = pdf;
     p->direction = ch->wi;
-    p->origin = leave_surface(frame->scene, &w->surfaces[id], ch->wi);
+    p->origin = tr_leave_surface(frame->scene, w->surfaces[id].p, w->surfaces[id].ng, ch->wi);
     return true;
 }
 
@@ -881,10 +853,7 @@ static void trace_batch(tr_worker *w, const tr_frame *frame, int tile, int sampl
 
 void tr_render_tile(tr_worker *w, const tr_frame *frame, int tile)
 {
-#if defined(__SSE2__)
-    _MM_SET_FLUSH_ZERO_MODE(_MM_FLUSH_ZERO_ON);
-    _mm_setcsr(_mm_getcsr() | 0x0040); /* denormals are zero */
-#endif
+    tr_flush_denormals();
     double start = tr_wall_seconds();
     bool recording = frame->record && frame->method->record &&
                      (!frame->method->wants_records || frame->method->wants_records(frame->method_data, tile));

@@ -4,6 +4,43 @@
 
 #include "tracer.h"
 
+#if defined(__SSE2__)
+#include <immintrin.h>
+#endif
+
+/* Numbers below the normal ones are 0 on this thread from now on: they say nothing here and are slow. */
+static inline void tr_flush_denormals(void)
+{
+#if defined(__SSE2__)
+    _MM_SET_FLUSH_ZERO_MODE(_MM_FLUSH_ZERO_ON);
+    _mm_setcsr(_mm_getcsr() | 0x0040); /* denormals are zero */
+#endif
+}
+
+static inline void tr_set_ray(struct RTCRay *ray, vec3 o, vec3 d, float far)
+{
+    ray->org_x = o.x;
+    ray->org_y = o.y;
+    ray->org_z = o.z;
+    ray->tnear = 0;
+    ray->dir_x = d.x;
+    ray->dir_y = d.y;
+    ray->dir_z = d.z;
+    ray->time = 0;
+    ray->tfar = far;
+    ray->mask = 0xffffffffu;
+    ray->id = 0;
+    ray->flags = 0;
+}
+
+/* Leave the surface at p on the side of w, by a step that covers rounding of the hit point. */
+static inline vec3 tr_leave_surface(const tr_scene *scene, vec3 p, vec3 ng, vec3 w)
+{
+    float size = max3(v3(fabsf(p.x), fabsf(p.y), fabsf(p.z)));
+    float step = 2e-5f * tr_max(size, 0.01f * scene->bounds_radius);
+    return madd3(p, ng, dot3(ng, w) < 0 ? -step : step);
+}
+
 #define TR_TILE_W 32
 #define TR_TILE_H 16
 #define TR_BATCH (TR_TILE_W * TR_TILE_H)

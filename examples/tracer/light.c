@@ -1,6 +1,6 @@
 /* light.c: which light to sample, directions to lights with their densities, emitted and environment radiance.
 
-   contents: >>tables >>envmap >>area >>cone >>queries
+   contents: >>envmap >>tables >>cone >>area >>queries >>emission
 
    Light sampling picks a light by estimated power, then a point on it or a direction to it. The environment (envmap,
    constant, sun) is treated as one light with several sampling strategies: a sampled direction carries the radiance of
@@ -192,14 +192,18 @@ static bool is_environment(const tr_light *light)
     return light->type == TR_LIGHT_ENVMAP || light->type == TR_LIGHT_CONSTANT || light->type == TR_LIGHT_SUN;
 }
 
+static double bounds_radius(const tr_scene *scene)
+{
+    return scene->bounds_radius > 0 && isfinite(scene->bounds_radius) ? scene->bounds_radius : 1;
+}
+
 /* Power into the scene, mean over channels. The environment's goes through the disk that the scene's bounding sphere
    shows to each direction. */
 static double light_power(const tr_scene *scene, const tr_light *light, double envmap_integral)
 {
     const double pi = 3.14159265358979323846;
     double value = ((double)light->value.x + light->value.y + light->value.z) / 3;
-    double radius = scene->bounds_radius > 0 && isfinite(scene->bounds_radius) ? scene->bounds_radius : 1;
-    double disk = pi * radius * radius;
+    double radius = bounds_radius(scene), disk = pi * radius * radius;
     switch (light->type) {
     case TR_LIGHT_AREA:
         return value * scene->shapes[light->shape].area * pi;
@@ -217,6 +221,28 @@ static double light_power(const tr_scene *scene, const tr_light *light, double e
         return value * 2 * pi * (1 - (double)light->cutoff_cos) * disk;
     }
     return 0;
+}
+
+/* Area of the shadow that the scene's bounding box casts along d, and of each of the three pairs of faces in it. */
+static float box_shadow(const tr_scene *scene, vec3 d, float face[3])
+{
+    vec3 e = sub3(scene->bounds_max, scene->bounds_min);
+    face[0] = e.y * e.z * fabsf(d.x);
+    face[1] = e.z * e.x * fabsf(d.y);
+    face[2] = e.x * e.y * fabsf(d.z);
+    return face[0] + face[1] + face[2];
+}
+
+/* Share of what light_power counts that photons carry: they start from the box, which is smaller than its sphere. */
+static double photon_share(const tr_scene *scene, const tr_light *light)
+{
+    const double disk = 3.14159265358979323846 * bounds_radius(scene) * bounds_radius(scene);
+    float face[3];
+    if (light->type == TR_LIGHT_DIRECTIONAL || light->type == TR_LIGHT_SUN)
+        return box_shadow(scene, light->direction, face) / disk;
+    if (light->type == TR_LIGHT_ENVMAP || light->type == TR_LIGHT_CONSTANT)
+        return 0.5 * box_shadow(scene, v3s(1), face) / disk; /* a convex body's mean shadow: surface / 4 (Cauchy) */
+    return 1;
 }
 
 /* Switch off what cannot be sampled, saying so. A light that is merely black says nothing. */
@@ -240,7 +266,7 @@ static bool light_usable(const tr_scene *scene, tr_light *light, tr_log *log)
     return !reason;
 }
 
-static void select_lights(tr_scene *scene, double *power)
+static void select_lights(tr_scene *scene, double *power, const double *photon_power)
 {
     uint32_t n = (uint32_t)scene->light_count;
     double total = 0;
@@ -249,13 +275,14 @@ static void select_lights(tr_scene *scene, double *power)
         total += power[i];
         lit += power[i] > 0;
     }
+    scene->light_cdf[0] = scene->power_cdf[0] = 0;
+    if (n)
+        cdf_build(scene->power_cdf, photon_power, n);
     for (uint32_t i = 0; i < n; ++i)
         if (power[i] > 0)
             power[i] = (1 - UNIFORM_SHARE) * power[i] / total + UNIFORM_SHARE / lit;
     if (n)
         cdf_build(scene->light_cdf, power, n);
-    else
-        scene->light_cdf[0] = 0;
     for (uint32_t i = 0; i < n; ++i) /* as drawn, rounding and all */
         scene->lights[i].selection = scene->light_cdf[i + 1] - scene->light_cdf[i];
 }
@@ -267,8 +294,9 @@ bool tr_lights_finish(tr_scene *scene, tr_log *log)
     free(scene->light_cdf);
     scene->environment_count = 0;
     scene->environment = malloc((n + 1) * sizeof(int));
-    scene->light_cdf = malloc((n + 1) * sizeof(float));
-    double *power = malloc((n + 1) * sizeof(double));
+    scene->light_cdf = malloc(2 * (n + 1) * sizeof(float));
+    scene->power_cdf = scene->light_cdf ? scene->light_cdf + n + 1 : NULL;
+    double *power = malloc(2 * (n + 1) * sizeof(double)), *photon_power = power + n + 1;
     bool ok = scene->environment && scene->light_cdf && power;
     for (size_t i = 0; ok && i < n; ++i) {
         tr_light *light = &scene->lights[i];
@@ -285,9 +313,12 @@ bool tr_lights_finish(tr_scene *scene, tr_log *log)
         power[i] = light_usable(scene, light, log) ? light_power(scene, light, integral) : 0;
         if (!(power[i] > 0) || isinf(power[i]))
             power[i] = 0;
+        photon_power[i] = power[i] > 0 ? power[i] * photon_share(scene, light) : 0;
+        if (!isfinite(photon_power[i]))
+            photon_power[i] = 0;
     }
     if (ok)
-        select_lights(scene, power);
+        select_lights(scene, power, photon_power);
     else
         tr_message(log, TR_ERROR, scene->path, 0, "out of memory for the light tables");
     free(power);
@@ -572,4 +603,101 @@ vec3 tr_environment(const tr_scene *scene, vec3 direction)
             sum = add3(sum, light->value);
     }
     return sum;
+}
+
+/* ---- >>emission --------------------------------------------------------------------------------------------- */
+
+/* From the front of an area light, by area and cosine. Returns flux over radiance. */
+static float emit_area(const tr_scene *scene, const tr_light *light, const float u[5], tr_emission *out)
+{
+    const tr_shape *shape = &scene->shapes[light->shape];
+    area_point point;
+    if (shape->type == TR_SHAPE_MESH) {
+        float rest = cdf_rest(scene->power_cdf, (uint32_t)out->light, u[0]);
+        triangle_point(shape, cdf_find(shape->area_cdf, shape->triangle_count, u[1]), rest, u[1], u[2], &point);
+    } else {
+        analytic_point(shape, u[1], u[2], &point);
+    }
+    frame3 f = frame_from_normal(point.ng);
+    out->p = point.p;
+    out->ng = point.ng;
+    out->direction = norm3(to_world(&f, sample_cosine_hemisphere(u[3], u[4])));
+    return TR_PI / point.pdf;
+}
+
+/* From a point or spot light. Returns flux over intensity. */
+static float emit_point(const tr_light *light, const float u[5], tr_emission *out)
+{
+    out->p = light->position;
+    out->delta = true;
+    if (light->type == TR_LIGHT_POINT) {
+        out->direction = sample_uniform_sphere(u[3], u[4]);
+        return 4 * TR_PI;
+    }
+    float width = 1 - light->cutoff_cos;
+    out->direction = cone_sample(light->direction, width, u[3], u[4]);
+    return spot_falloff(light, dot3(out->direction, light->direction)) / cone_pdf(width);
+}
+
+/* Where light from wi enters the bounding box, drawn evenly from the shadow that it casts; then back, out of the scene.
+   Returns the shadow's area. */
+static float enter_box(const tr_scene *scene, vec3 wi, float u1, float u2, vec3 *p)
+{
+    float face[3], area = box_shadow(scene, wi, face), at[3], x = u1 * area;
+    const float lo[3] = {scene->bounds_min.x, scene->bounds_min.y, scene->bounds_min.z};
+    const float hi[3] = {scene->bounds_max.x, scene->bounds_max.y, scene->bounds_max.z};
+    const float d[3] = {wi.x, wi.y, wi.z};
+    int k = x < face[0] ? 0 : x < face[0] + face[1] || !(face[2] > 0) ? 1 : 2;
+    x = (k == 0 ? x : k == 1 ? x - face[0] : x - face[0] - face[1]) / face[k];
+    at[k] = d[k] > 0 ? hi[k] : lo[k];
+    at[(k + 1) % 3] = lerpf(lo[(k + 1) % 3], hi[(k + 1) % 3], clampf(x, 0, 1));
+    at[(k + 2) % 3] = lerpf(lo[(k + 2) % 3], hi[(k + 2) % 3], u2);
+    *p = madd3(v3(at[0], at[1], at[2]), wi, (float)bounds_radius(scene));
+    return area;
+}
+
+/* From a light without a place, parallel. *value is radiance, of a directional light irradiance. Returns flux over
+   that. */
+static float emit_distant(const tr_scene *scene, const tr_light *light, const float u[5], vec3 *value, tr_emission *out)
+{
+    float pdf = 1;
+    out->distant = true;
+    vec3 wi = neg3(light->direction);
+    if (light->type == TR_LIGHT_ENVMAP) {
+        wi = envmap_sample(light, u[3], u[4]);
+        pdf = envmap_pdf(light, wi);
+        *value = envmap_radiance(light, wi);
+    } else if (light->type == TR_LIGHT_CONSTANT) {
+        wi = sample_uniform_sphere(u[3], u[4]);
+        pdf = 0.25f * TR_INV_PI;
+    } else if (light->type == TR_LIGHT_SUN) {
+        wi = cone_sample(wi, 1 - light->cutoff_cos, u[3], u[4]);
+        pdf = cone_pdf(1 - light->cutoff_cos);
+    } else {
+        out->delta = true;
+    }
+    out->direction = neg3(wi);
+    return pdf > 0 ? enter_box(scene, wi, u[1], u[2], &out->p) / pdf : 0;
+}
+
+bool tr_light_emit(const tr_scene *scene, const float u[5], tr_emission *emission)
+{
+    uint32_t n = (uint32_t)scene->light_count;
+    tr_emission *out = emission;
+    if (!n || !(scene->power_cdf[n] > 0))
+        return false;
+    uint32_t i = cdf_find(scene->power_cdf, n, u[0]);
+    const tr_light *light = &scene->lights[i];
+    memset(out, 0, sizeof *out);
+    out->light = (int)i;
+    vec3 value = light->value;
+    float flux;
+    if (light->type == TR_LIGHT_AREA)
+        flux = emit_area(scene, light, u, out);
+    else if (light->type == TR_LIGHT_POINT || light->type == TR_LIGHT_SPOT)
+        flux = emit_point(light, u, out);
+    else
+        flux = emit_distant(scene, light, u, &value, out);
+    out->flux = scale3(value, flux / (scene->power_cdf[i + 1] - scene->power_cdf[i]));
+    return finite3(out->flux) && finite3(out->p) && max3(out->flux) > 0;
 }

@@ -13,8 +13,10 @@
 #include <string.h>
 
 #define MAX_GROUPS 32
-#define GROWTH 4              /* a learning pass is 1 / GROWTH of all before it */
-#define ROUND_PATHS (1 << 17) /* camera paths between two flushes: bounds the memory of records; each may be split */
+#define GROWTH 4 /* a learning pass is 1 / GROWTH of all before it */
+#define ROUND_PATHS                                                                                                    \
+    (1 << 17) /* camera paths between two flushes: bounds the memory of records; each may be split; the                \
+                 same of photon paths */
 
 /* Passes that were sampled in the same way, or nearly so: plain sums are the best way to join them. */
 typedef struct group {
@@ -37,7 +39,8 @@ typedef struct render_state {
     int group_count;
     tr_image estimate, combined, variance;
     tr_result *result;
-    double start_cpu, update_cpu;
+    double start_cpu, update_cpu, photon_cpu;
+    tr_photon_stats photons;
     uint64_t round_tile; /* first tile of the round */
     bool guided;         /* the last pass met cells that guide */
     bool frozen;         /* after the training: one pass that teaches nothing */
@@ -64,10 +67,10 @@ static void render_tiles(void *context, uint32_t begin, uint32_t end)
     pthread_mutex_unlock(&r->lock);
 }
 
-static void flush_records(render_state *r)
+static void flush_records(render_state *r, bool recorded)
 {
     double start = tr_cpu_seconds();
-    if (r->frame.record && r->settings->method->flush)
+    if (recorded && r->settings->method->flush)
         r->settings->method->flush(r->frame.method_data);
     r->update_cpu += tr_cpu_seconds() - start;
 }
@@ -85,8 +88,33 @@ static void render_samples(render_state *r, uint64_t first_sample, int samples)
         int count = tiles - first < per_round ? tiles - first : per_round;
         r->round_tile = (uint64_t)first;
         tr_pool_run(r->pool, (uint32_t)count, 1, render_tiles, r);
-        flush_records(r);
+        flush_records(r, r->frame.record);
     }
+}
+
+/* The photons that the method wants, before the camera paths of a pass. False = out of memory. */
+static bool shoot_photons(render_state *r, const tr_pass *info)
+{
+    const tr_method *m = r->settings->method;
+    uint64_t total = m->wants_photons && m->record_photons ? m->wants_photons(r->frame.method_data, info) : 0;
+    bool ok = true;
+    for (uint64_t first = 0; ok && first < total; first += ROUND_PATHS) {
+        tr_photon_pass pass = {.scene = r->frame.scene,
+                               .seed = r->settings->seed,
+                               .index = info->index,
+                               .total = total,
+                               .first = first,
+                               .count = (uint32_t)(total - first < ROUND_PATHS ? total - first : ROUND_PATHS),
+                               .max_depth = r->frame.max_depth,
+                               .nee = r->frame.nee,
+                               .parallel = tr_pool_run,
+                               .parallel_user = r->pool};
+        double start = tr_cpu_seconds();
+        ok = tr_trace_photons(&pass, m->record_photons, r->frame.method_data, &r->photons);
+        r->photon_cpu += tr_cpu_seconds() - start;
+        flush_records(r, ok);
+    }
+    return ok;
 }
 
 static int samples_per_round(const render_state *r)
@@ -465,6 +493,8 @@ static bool next_pass(render_state *r, int limit)
     r->frame.record = m->begin_pass ? m->begin_pass(r->frame.method_data, &info) : m->record != NULL;
     r->frame.guiding = m->find && !(m->idle && m->idle(r->frame.method_data));
     r->frame.estimate = m->wants_pixel_estimate && pass > 0 ? &r->estimate : NULL;
+    if (!shoot_photons(r, &info))
+        return false;
     info.spp = run_pass(r, pass, info.spp);
     r->cost = (cpu_used(r) - cpu) / info.spp;
     r->guided = total_guided(r) > guided_before;
@@ -548,18 +578,22 @@ static bool collect(render_state *r)
         sum.bad_samples += c->bad_samples;
         sum.out_of_memory |= c->out_of_memory;
     }
-    double workers_cpu = res->cpu_seconds - r->update_cpu;
+    double workers_cpu = res->cpu_seconds - r->update_cpu - r->photon_cpu;
     double scale = sum.total > 0 ? workers_cpu / sum.total : 0;
     res->trace_seconds = sum.trace * scale;
     res->record_seconds = sum.record * scale;
     res->query_seconds = sum.query * scale;
     res->update_seconds = r->update_cpu;
+    res->photon_seconds = r->photon_cpu;
+    res->photon_paths = r->photons.paths;
+    res->photon_rays = r->photons.rays;
+    res->photons = r->photons.photons;
     res->rays = sum.rays;
     res->shadow_rays = sum.shadow_rays;
     res->paths = sum.paths;
     res->split_paths = sum.split_paths;
     res->unsplit_paths = sum.unsplit_paths;
-    res->bad_samples = sum.bad_samples;
+    res->bad_samples = sum.bad_samples + r->photons.bad;
     double total = 0;
     for (int i = 0; i < r->group_count; ++i)
         total += r->groups[i].weight;
@@ -581,6 +615,7 @@ static bool create_method(render_state *r, char *err, size_t err_size)
                          .width = r->frame.width,
                          .height = r->frame.height,
                          .tiles = r->frame.tiles_x * r->frame.tiles_y,
+                         .photon_tiles = tr_photon_tiles(ROUND_PATHS),
                          .nee = r->frame.nee,
                          .train = s->train,
                          .seed = s->seed,

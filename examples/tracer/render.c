@@ -227,12 +227,18 @@ static void json_number(FILE *f, const char *key, double value)
         fprintf(f, "  \"%s\": null,\n", key);
 }
 
+/* CPU seconds of what is timed by itself. */
+static double all_parts(const tr_result *r)
+{
+    return r->trace_seconds + r->record_seconds + r->update_seconds + r->query_seconds + r->photon_seconds;
+}
+
 static bool write_json(const char *path, const options *o, const tr_result *r, const tr_error *e)
 {
     FILE *f = !strcmp(path, "-") ? stdout : fopen(path, "w");
     if (!f)
         return false;
-    double parts = r->trace_seconds + r->record_seconds + r->update_seconds + r->query_seconds;
+    double parts = all_parts(r);
     fputs("{\n", f);
     json_string(f, "scene", o->scene);
     json_string(f, "method", o->method);
@@ -251,6 +257,10 @@ static bool write_json(const char *path, const options *o, const tr_result *r, c
     json_number(f, "record_seconds", r->record_seconds);
     json_number(f, "update_seconds", r->update_seconds);
     json_number(f, "query_seconds", r->query_seconds);
+    json_number(f, "photon_seconds", r->photon_seconds);
+    json_number(f, "photon_paths", (double)r->photon_paths);
+    json_number(f, "photon_rays", (double)r->photon_rays);
+    json_number(f, "photons", (double)r->photons);
     json_number(f, "rays", (double)r->rays);
     json_number(f, "shadow_rays", (double)r->shadow_rays);
     json_number(f, "paths", (double)r->paths);
@@ -317,14 +327,17 @@ static int write_outputs(const options *o, const tr_result *r)
     if (o->json && !write_json(o->json, o, r, measured ? &e : NULL))
         rc = die("%s: cannot write the statistics: %s", o->json, strerror(errno));
     if (!o->quiet) {
-        double parts = r->trace_seconds + r->record_seconds + r->update_seconds + r->query_seconds;
+        double parts = all_parts(r);
         printf("%s: %d spp in %.2f CPU s", o->method, r->spp, r->cpu_seconds);
         if (o->settings.train)
             printf(", of which %.2f for %d spp of training", r->train_seconds, o->settings.train);
-        printf(" (trace %.0f %%, shade %.0f %%, query %.0f %%, record %.0f %%, update %.0f %%)",
+        printf(" (trace %.0f %%, shade %.0f %%, query %.0f %%, record %.0f %%, update %.0f %%",
                100 * r->trace_seconds / r->cpu_seconds, 100 * (1 - parts / r->cpu_seconds),
                100 * r->query_seconds / r->cpu_seconds, 100 * r->record_seconds / r->cpu_seconds,
                100 * r->update_seconds / r->cpu_seconds);
+        if (r->photon_paths)
+            printf(", photons %.0f %%", 100 * r->photon_seconds / r->cpu_seconds);
+        printf(")");
         if (r->method.cells)
             printf(", %.0f cells, %.1f MB", (double)r->method.cells, (double)r->method.bytes / 1e6);
         if (measured)

@@ -1,7 +1,7 @@
 /* tracer.h: the example renderer's shared types: scene, surfaces, closures, lights, images, methods.
 
    contents: >>log >>image >>texture >>bsdf >>shape >>light >>scene >>surface >>closure >>lightquery
-             >>vertex >>method >>render
+             >>vertex >>photon >>method >>render
 
    Conventions. World space, metres; radiance in W/m^2/sr per RGB channel (linear sRGB primaries). Directions are unit
    vectors that point away from the surface: wo towards the viewer, wi towards the light. A pdf is per steradian unless
@@ -295,6 +295,8 @@ typedef struct tr_scene {
     int *environment; /* ids of envmap, constant and sun lights */
     int environment_count;
     float *light_cdf; /* [light_count + 1] */
+    float
+        *power_cdf; /* [light_count + 1], by power alone: which light a photon comes from; within light_cdf's memory */
     uint64_t triangles;
     RTCDevice device;
     RTCScene rtc;
@@ -382,6 +384,12 @@ bool tr_closure_sample(const tr_closure *closure, float u_lobe, float u1, float 
    of the relative index when the path refracts (1 otherwise), by which roulette corrects the throughput. */
 bool tr_closure_sample_delta(const tr_closure *closure, float u, vec3 *wi, vec3 *weight, float *eta_scale);
 vec3 tr_closure_albedo(const tr_closure *closure); /* approximate, for the albedo layer */
+/* Draw where light goes on that came along wo: `to` (world) from the delta part (where u[0] < delta_probability) or the
+   smooth part, and the share of flux that goes there over its probability. The adjoint of what camera paths see (Veach
+   1997, 5.2 and 5.3): nothing gathers in the denser side, and a shading normal ns beside the geometric one ng counts
+   as |wo.ns to.ng| / (|wo.ng to.ns|). u in [0,1)^4. False = absorbed. */
+bool tr_closure_sample_adjoint(const tr_scene *scene, const tr_surface *surface, const tr_closure *closure,
+                               const float u[4], vec3 *to, vec3 *weight, bool *delta);
 
 /* ---- >>lightquery ------------------------------------------------------------------------------------------- */
 
@@ -404,6 +412,21 @@ float tr_light_pdf(const tr_scene *scene, vec3 p, vec3 wi, const tr_surface *hit
 vec3 tr_surface_emission(const tr_scene *scene, const tr_surface *surface, vec3 wo);
 /* Radiance arriving from the environment along direction (pointing away from the scene). */
 vec3 tr_environment(const tr_scene *scene, vec3 direction);
+
+/* Light on its way from a light source. */
+typedef struct tr_emission {
+    vec3 p, direction; /* the lights without a place start beyond the scene's bounds */
+    vec3 ng;           /* front normal of an area light's surface, else 0 */
+    vec3 flux;         /* W: power over the probability of this ray; its mean over all u is the power of all lights */
+    bool distant;      /* from a light without a place */
+    bool delta;        /* from a light that no camera path can hit */
+    int light;
+} tr_emission;
+
+/* Draw a ray that leaves a light: the light by power, a point on it by area, a direction by cosine or by the
+   environment map; those without a place shine on the disk that the scene's bounding sphere shows them. u in [0,1)^5:
+   light, place, direction. False = none (no light has power, or a spot's rim). */
+bool tr_light_emit(const tr_scene *scene, const float u[5], tr_emission *emission);
 
 /* ---- >>vertex ----------------------------------------------------------------------------------------------- */
 
@@ -429,11 +452,59 @@ typedef struct tr_vertex {
 #define TR_VERTEX_FIRST 2u    /* first non-delta vertex seen by the camera */
 #define TR_VERTEX_PASSES 4u   /* light also passes through: directions on both sides of ns */
 
-/* ---- >>method ----------------------------------------------------------------------------------------------- */
+/* ---- >>photon ----------------------------------------------------------------------------------------------- */
 
 typedef void (*tr_range_fn)(void *context, uint32_t begin, uint32_t end);
 /* Calls fn on disjoint ranges covering [0, count) from several threads and returns when all are done. */
 typedef void (*tr_parallel_fn)(void *user, uint32_t count, uint32_t grain, tr_range_fn fn, void *context);
+
+/* Light that arrives at a surface that scatters, not only as a mirror or smooth glass does. The sum of flux over an
+   area is the flux that arrives there (by the geometric normal): the surface reflects flux f |wi.ns| / |wi.ng| of it
+   per area and steradian. */
+typedef struct tr_photon {
+    vec3 p;         /* where it arrives */
+    vec3 wi;        /* unit, towards where it came from */
+    vec3 flux;      /* W; the paths of a pass together carry the power of all lights */
+    float distance; /* along the path to the vertex before it that is not delta, or the light: a mirror's picture lies
+                       behind it; +INFINITY = the environment, a sun or directional light */
+    vec3 ng, ns;    /* at p; ns as the bsdf turned it */
+    int bounces;    /* surfaces it has left before, delta ones too */
+    uint32_t flags; /* TR_PHOTON_..., 0 = what a guided direction from p can find */
+} tr_photon;
+#define TR_PHOTON_DIRECT 1u /* straight from a light, which next event estimation samples */
+#define TR_PHOTON_UNSEEN                                                                                               \
+    2u /* light that no camera path gathers: a point's, spot's or directional light's through glass                    \
+          or mirrors, or any of theirs without next event estimation */
+
+/* Photon paths first .. first + count - 1 of pass `index`, whose paths are `total`. */
+typedef struct tr_photon_pass {
+    const tr_scene *scene;
+    uint64_t seed;
+    int index;
+    uint64_t total, first;
+    uint32_t count;
+    int max_depth; /* path edges from light to camera, which takes one; <= 0 or > TR_MAX_DEPTH: TR_MAX_DEPTH */
+    bool nee;      /* camera paths use next event estimation */
+    tr_parallel_fn parallel; /* NULL = serial */
+    void *parallel_user;
+} tr_photon_pass;
+
+typedef struct tr_photon_stats {
+    uint64_t paths, photons, rays;
+    uint64_t bad;                  /* dropped: weights that are NaN or infinite */
+    double emitted[3], escaped[3]; /* W: that these paths began with; of it and what was reflected, what met nothing */
+} tr_photon_stats;
+
+#define TR_PHOTON_TILE 2048 /* paths of a tile; its photons come in one order, whatever the threads */
+static inline int tr_photon_tiles(uint32_t count) { return (int)((count + TR_PHOTON_TILE - 1u) / TR_PHOTON_TILE); }
+
+/* Takes n photons of a tile (0 .. tr_photon_tiles(count) - 1): called many times for a tile, by one thread at a time,
+   for different tiles at once. False = out of memory. */
+typedef bool (*tr_photon_fn)(void *user, int tile, const tr_photon *photons, int n);
+/* Trace them. stats may be NULL, else they are added to. False = out of memory, here or there. */
+bool tr_trace_photons(const tr_photon_pass *pass, tr_photon_fn take, void *user, tr_photon_stats *stats);
+
+/* ---- >>method ----------------------------------------------------------------------------------------------- */
 
 typedef struct tr_option {
     const char *key, *value; /* from --set key=value */
@@ -443,7 +514,8 @@ typedef struct tr_option {
 typedef struct tr_method_env {
     const tr_scene *scene;
     int width, height;
-    int tiles; /* streams that record is called with: 0 .. tiles - 1 */
+    int tiles;        /* streams that record is called with: 0 .. tiles - 1 */
+    int photon_tiles; /* the same of record_photons */
     bool nee;
     int train; /* samples per pixel after which the field is frozen; 0 = it learns while it renders */
     uint64_t seed;
@@ -476,9 +548,9 @@ typedef struct tr_method_stats {
 } tr_method_stats;
 
 /* A guiding method. Handles have handle_size bytes, zero at first; they are found once a vertex, asked many times and
-   copied where a path splits. Every function but find, sample, pdf and record (one stream per thread at a time) is
-   called by one thread. NULL entries are allowed everywhere but create and destroy: a method without find never
-   guides. */
+   copied where a path splits. Every function but find, sample, pdf, record and record_photons (one stream per
+   thread at a time) is called by one thread. NULL entries are allowed everywhere but create and destroy: a method
+   without find never guides. */
 typedef struct tr_method {
     const char *name, *summary;
     size_t handle_size;
@@ -506,8 +578,10 @@ typedef struct tr_method {
     void (*describe)(void *method, int n, const void *handles, float *cell, float *depth); /* for the picture layers */
     void (*set_pixel_estimate)(void *method, const tr_image *estimate);
     bool wants_pixel_estimate;
-    bool (*wants_photons)(void *method);
-    bool (*record_photons)(void *method, const tr_vertex *photons, int n);
+    /* Photon paths to trace before this pass's camera paths, after begin_pass; 0 = none. */
+    uint64_t (*wants_photons)(void *method, const tr_pass *pass);
+    /* A tr_photon_fn: streams like record's, taken in by flush. */
+    bool (*record_photons)(void *method, int tile, const tr_photon *photons, int n);
     void (*stats)(void *method, tr_method_stats *stats);
 } tr_method;
 
@@ -546,8 +620,11 @@ typedef struct tr_result {
     int spp, passes, train_passes; /* train_passes: the first ones, which are not in the picture */
     double cpu_seconds, wall_seconds;
     double train_seconds; /* CPU seconds until the method had learned for the last time; what follows renders only */
-    double trace_seconds, record_seconds, update_seconds, query_seconds; /* CPU seconds, of which shading is the rest */
-    uint64_t rays, shadow_rays, paths;
+    double trace_seconds, record_seconds, update_seconds, query_seconds; /* CPU seconds; shading is the rest */
+    double photon_seconds;                                               /* CPU seconds, of none of those above */
+    uint64_t rays, shadow_rays, paths;                                   /* of camera paths */
+    uint64_t photon_paths, photon_rays;
+    uint64_t photons;                    /* handed to the method */
     uint64_t split_paths, unsplit_paths; /* that guided roulette added; that it had no room for */
     uint64_t bad_samples;                /* NaN or infinite contributions dropped */
     tr_method_stats method;
