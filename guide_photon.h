@@ -58,7 +58,8 @@
      unit, world space, away from the surface towards the light.
 
      What is learned is the histogram after desc.repair, the classical filters of Table 1 that need no network, or the
-     map that gph_import_maps wrote in its place. Filters know that phi wraps and that the way over a pole goes on at
+     map that gph_import_maps wrote in its place. The Gaussian's width is chosen for each map by what its photons say of
+     each other. Filters know that phi wraps and that the way over a pole goes on at
      phi + pi.
 
      Splits: a voxel that has seen more photons than split_photons sqrt(N / N_0) is halved, at most 3 levels a refine;
@@ -94,13 +95,13 @@
    OPTIONS: see gph_desc. gph_resolve fills in defaults, gph_get_desc returns what a field uses.
 
    MEMORY
-     n = bins (rows * rows * 2). Sampling part: 16 bytes per voxel, 3 n + 8 per map (1.5 times its half-floats), 8 per
-     node, 24 to 48 per cube. Building part: 336 bytes per voxel; its histogram is nothing while empty, a list of 16
-     bytes per lit bin below 256 photons, 12 n bytes above. The first pass's photons wait in 24 bytes each, at most
-     desc.cloud_photons. refine makes a new sampling part beside the old one. max_bytes bounds both parts and the new
-     one together: beyond it cubes, histograms and splits are denied and counted.
-     Allocation happens in create, stream_create, record, accumulate, refine, load; never in a query, and always from
-   the calling thread. Stack: below 140 KB per call of refine and gph_import_maps, 8 KB for others.
+     n = bins (rows * rows * 2). Sampling part: 16 bytes per voxel, 3 n + 8 rows + 64 per map (1.58 times its
+   half-floats), 8 per node, 24 to 48 per cube. Building part: 336 bytes per voxel; its histogram is nothing while
+   empty, a list of 16 bytes per lit bin below 256 photons, 12 n bytes above. The first pass's photons wait in 24 bytes
+   each, at most desc.cloud_photons. refine makes a new sampling part beside the old one. max_bytes bounds both parts
+   and the new one together: beyond it cubes, histograms and splits are denied and counted. Allocation happens in
+   create, stream_create, record, accumulate, refine, load; never in a query, and always from the calling thread. Stack:
+   below 140 KB per call of refine and gph_import_maps, 8 KB for others.
 
    THREADS: each function has a tag.
      [any thread]   pure function on constant data
@@ -194,10 +195,10 @@ typedef struct gph_desc {
     float split_photons;                /* c of the split rule, 16 .. 1e9; default 500 */
     uint32_t max_levels;                /* of a cube's tree, 1 .. 24; default 18 */
     uint32_t keep_passes;               /* passes that an unread voxel is kept, 1 .. 1000; default 4 */
-    uint32_t cloud_photons; /* of the first pass that are kept for median splits, 1024 .. 2^28; default 2^21 */
-    uint64_t max_bytes;     /* memory cap, see MEMORY; >= 2^20; default 2^30 */
-    gph_repair repair;      /* of histograms before they are sampled */
-    float sigma; /* of the Gaussian, in bins; 0.01 .. 16; default 0 = by the number of photons, see >>repair */
+    uint32_t cloud_photons;  /* of the first pass that are kept for median splits, 1024 .. 2^28; default 2^21 */
+    uint64_t max_bytes;      /* memory cap, see MEMORY; >= 2^20; default 2^30 */
+    gph_repair repair;       /* of histograms before they are sampled */
+    float sigma;             /* of the Gaussian, in bins; 0.01 .. 16; default 0 = chosen for each map, see >>repair */
     uint32_t pyramid_levels; /* 1 .. 5; default 3 */
     gph_alpha_mode alpha_mode;
     float alpha; /* start value (and fixed value) of the probability of BSDF sampling, 0.05 .. 1; default 0.5 */
@@ -291,8 +292,9 @@ typedef struct gph_node {
 } gph_node;
 #define GPH_LEAF 0x80000000u
 
-/* Pointers into one sampling part. Valid until the next exclusive call. A map is rows * columns half-floats in rows of
-   constant z, then the exact sums of every 8 of them from the start (bins / 8 + 1 of 64 bits, unit 2^-24). */
+/* Pointers into one sampling part. Valid until the next exclusive call. A map: exact sums (64 bits, unit 2^-24) of the
+   weights before each row of constant z and of all (rows + 1 of them, then zeros up to 64 bytes), of the weights before
+   each 8 bins (bins / 8), then the weights, half-floats. */
 typedef struct gph_view {
     const uint64_t *keys;  /* hash table of cubes: mask + 1 slots, GPH_NO_KEY = free */
     const uint32_t *roots; /* beside the keys: node */
@@ -395,12 +397,13 @@ GPH_API gph_result gph_merge(gph_field *field, const gph_field *source, gph_para
 /* What sampling and densities need; about 80 bytes. */
 typedef struct gph_handle {
     const uint16_t *weights; /* half-floats; NULL = uniform */
-    const uint64_t *sums;
-    uint32_t voxel; /* GPH_NONE: none */
-    float alpha;    /* see Selection probability */
-    float uniform;  /* e; 1 where there is no map */
-    float scale;    /* density = scale * weight + uniform / (4 pi) */
-    double share;   /* (1 - e) / sum of weights */
+    const uint64_t *sums;    /* of the rows before */
+    const uint64_t *blocks;  /* of the eights before */
+    uint32_t voxel;          /* GPH_NONE: none */
+    float alpha;             /* see Selection probability */
+    float uniform;           /* e; 1 where there is no map */
+    float scale;             /* density = scale * weight + uniform / (4 pi) */
+    double share;            /* (1 - e) / sum of weights */
     uint32_t rows, columns;
     float normal[3];
     uint32_t surface; /* 1: normal is one, directions below are mirrored up */
@@ -475,11 +478,12 @@ GPH_QUERY void gph_set_voxel(const gph_view *view, uint32_t voxel, gph_handle *h
     handle->uniform = 1;
     if (map != GPH_NONE) {
         const unsigned char *p = view->maps + (size_t)map * view->map_bytes;
-        handle->weights = (const uint16_t *)(const void *)p;
-        handle->sums = (const uint64_t *)(const void *)(p + bins * sizeof(uint16_t));
+        handle->sums = (const uint64_t *)(const void *)p;
+        handle->blocks = handle->sums + ((view->rows + 8) & ~7u);
+        handle->weights = (const uint16_t *)(const void *)(handle->blocks + bins / 8);
         handle->alpha = view->voxels[voxel].alpha;
         handle->uniform = view->uniform;
-        handle->share = (1 - (double)view->uniform) / (double)handle->sums[bins / 8];
+        handle->share = (1 - (double)view->uniform) / (double)handle->sums[view->rows];
         handle->scale = (float)(handle->share * bins * 0.079577471545947668);
     }
 }
@@ -553,20 +557,21 @@ GPH_QUERY float gph_pdf(const gph_handle *handle, const float direction[3])
     return gph_pdf_sphere(handle, direction) + gph_pdf_sphere(handle, other);
 }
 
-/* Probability of the first 8 * block bins. */
-GPH_QUERY double gph_until(const gph_handle *handle, uint32_t block)
+/* Probability of what lies before entry i of sums, each of so many bins. */
+GPH_QUERY double gph_until(const gph_handle *handle, const uint64_t *sums, uint32_t i, uint32_t bins)
 {
-    return handle->share * (double)handle->sums[block] +
-           (double)handle->uniform * 8 / (double)(handle->rows * handle->columns) * (double)block;
+    return handle->share * (double)sums[i] +
+           (double)handle->uniform / (double)(handle->rows * handle->columns) * (double)(i * bins);
 }
 
-/* Last of the entries 0, step, ..., (count - 1) step past `first` whose sum is at most x. */
-GPH_QUERY uint32_t gph_search(const gph_handle *handle, uint32_t first, uint32_t step, uint32_t count, double x)
+/* Last of the entries first, ..., first + count - 1 before which lies at most x. */
+GPH_QUERY uint32_t gph_search(const gph_handle *handle, const uint64_t *sums, uint32_t first, uint32_t count,
+                              uint32_t bins, double x)
 {
-    uint32_t low = 0, high = count;
+    uint32_t low = first, high = first + count;
     while (high - low > 1) {
         uint32_t middle = (low + high) / 2;
-        if (gph_until(handle, first + middle * step) <= x)
+        if (gph_until(handle, sums, middle, bins) <= x)
             low = middle;
         else
             high = middle;
@@ -582,14 +587,14 @@ GPH_QUERY float gph_sample(const gph_handle *handle, const float u[2], float dir
     if (handle->weights) {
         uint32_t blocks = handle->columns / 8, row, block, bin, j;
         double x, low, mass, part, each = (double)handle->uniform / (double)(handle->rows * handle->columns), p = 0, v;
-        row = gph_search(handle, 0, blocks, handle->rows, (double)u[0]);
-        low = gph_until(handle, row * blocks);
-        mass = gph_until(handle, (row + 1) * blocks) - low;
+        row = gph_search(handle, handle->sums, 0, handle->rows, handle->columns, (double)u[0]);
+        low = gph_until(handle, handle->sums, row, handle->columns);
+        mass = gph_until(handle, handle->sums, row + 1, handle->columns) - low;
         v = ((double)u[0] - low) / mass;
         z = (float)(2 * (row + (v < 1 ? v : 1)) / handle->rows - 1);
         x = low + (double)u[1] * mass;
-        block = row * blocks + gph_search(handle, row * blocks, 1, blocks, x);
-        part = x - gph_until(handle, block);
+        block = gph_search(handle, handle->blocks, row * blocks, blocks, 8, x);
+        part = x - gph_until(handle, handle->blocks, block, 8);
         for (j = 0; j < 8; ++j) {
             p = handle->share * (double)gph_weight(handle->weights[block * 8 + j]) + each;
             if (part < p || j == 7)
@@ -2187,37 +2192,81 @@ static uint32_t gphi_over_pole(int *r, int rows, int columns)
     return m < rows ? 0 : (uint32_t)columns / 2;
 }
 
-/* Sigma in bins of 32 rows for so many photons: 1.9 for 100, 1.1 for 1,000, 0.6 for 10,000. */
-static double gphi_auto_sigma(uint32_t rows, double photons)
+/* to[i] += k from[i]. */
+static void gphi_add_row(float *to, const float *from, float k, int n)
 {
-    return fmin(6 * pow(fmax(photons, 1), -0.25), 4) * rows / 32;
+    int i;
+    for (i = 0; i < n; ++i)
+        to[i] += k * from[i];
 }
 
-/* Separable Gaussian blur of a[rows][columns], with b as scratch. Sum is kept within rounding. */
-static void gphi_blur(float *a, float *b, int rows, int columns, double sigma)
+/* Separable Gaussian blur of a[rows][columns], with b as scratch; the sum is kept. Rows without light cost nothing.
+   Returns the kernel's middle. */
+static float gphi_blur(float *a, float *b, int rows, int columns, double sigma)
 {
-    float kernel[2 * 48 + 1], *k = kernel + 48;
+    float kernel[2 * 48 + 1], *k = kernel + 48, wide[2 * GPHI_MAX_ROWS + 2 * 48];
     int radius = (int)ceil(3 * sigma), r, c, d;
+    bool lit[GPHI_MAX_ROWS];
     double sum = 0;
     radius = radius > 48 ? 48 : radius;
     for (d = -radius; d <= radius; ++d)
         sum += exp(-0.5 * d * d / (sigma * sigma));
     for (d = -radius; d <= radius; ++d)
         k[d] = (float)(exp(-0.5 * d * d / (sigma * sigma)) / sum);
-    for (r = 0; r < rows; ++r)
-        for (c = 0; c < columns; ++c) {
-            float s = 0;
-            for (d = -radius; d <= radius; ++d)
-                s += k[d] * a[r * columns + ((c + d) & (columns - 1))];
-            b[r * columns + c] = s;
-        }
+    memset(b, 0, (size_t)(rows * columns) * sizeof *b);
+    for (r = 0; r < rows; ++r) {
+        float *row = a + r * columns;
+        lit[r] = false;
+        for (c = 0; c < columns; ++c)
+            lit[r] = lit[r] || row[c] > 0;
+        if (!lit[r])
+            continue;
+        for (c = -radius; c < columns + radius; ++c)
+            wide[c + radius] = row[c & (columns - 1)];
+        for (d = -radius; d <= radius; ++d)
+            gphi_add_row(b + r * columns, wide + radius + d, k[d], columns);
+    }
     memset(a, 0, (size_t)(rows * columns) * sizeof *a);
     for (r = 0; r < rows; ++r)
         for (d = -radius; d <= radius; ++d) {
             int from = r + d, shift = (int)gphi_over_pole(&from, rows, columns);
-            for (c = 0; c < columns; ++c)
-                a[r * columns + c] += k[d] * b[from * columns + ((c + shift) & (columns - 1))];
+            if (!lit[from])
+                continue;
+            gphi_add_row(a + r * columns, b + from * columns + shift, k[d], columns - shift);
+            gphi_add_row(a + r * columns + columns - shift, b + from * columns, k[d], shift);
         }
+    return k[0];
+}
+
+/* Sigma of the Gaussian under which each photon is most likely given all others: sum over bins of flux times
+   log of (1 - e) (b - k^2 w) / (sum - w) + e / bins, b the blurred histogram, k the kernel's middle, w the mean flux of
+   the bin's photons. Leave-one-out cross-validation, own. map: the histogram; its second half and scratch are lost. */
+static double gphi_choose_sigma(const gph_field *f, const gphi_voxel *v, float *map, float *scratch)
+{
+    static const double sigmas[] = {0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0};
+    int rows = (int)f->desc.rows, s;
+    uint32_t i, n = gphi_bins(v, f->bins);
+    double best = -INFINITY, sigma = 1, sum = 0, e = (double)f->desc.uniform;
+    for (i = 0; i < f->bins; ++i)
+        sum += (double)map[i];
+    for (s = 0; s < 8; ++s) {
+        double likely = 0, wide = sigmas[s] * rows / 32, middle;
+        memcpy(map + f->bins, map, f->bins * sizeof *map);
+        middle = (double)gphi_blur(map + f->bins, scratch, rows, 2 * rows, wide);
+        for (i = 0; i < n; ++i) {
+            gphi_bin b = gphi_get_bin(v, f->bins, i);
+            double flux = (double)map[b.at], one = flux / ((double)*b.count_old + *b.count_now), others;
+            if (!(flux > 0))
+                continue;
+            others = ((double)map[f->bins + b.at] - middle * middle * one) / fmax(sum - one, 1e-9 * sum);
+            likely += flux / sum * log((1 - e) * fmax(others, 0) + e / f->bins);
+        }
+        if (likely > best) {
+            best = likely;
+            sigma = wide;
+        }
+    }
+    return sigma;
 }
 
 /* Value of a coarse map [rows][columns] at the centre of bin (r, c) of the map twice as fine: linear interpolation. */
@@ -2284,9 +2333,8 @@ static void gphi_repair_map(const gph_field *f, const gphi_voxel *v, float *map,
         scratch[b.at] = *b.count_old || *b.count_now ? 1.0f : 0.0f;
     }
     if (f->desc.repair == GPH_REPAIR_GAUSSIAN) {
-        double sigma = f->desc.sigma > 0 ? (double)f->desc.sigma : gphi_auto_sigma(f->desc.rows, v->s.photons);
-        if (sigma > 0.2) /* the next bin gets 4e-6 */
-            gphi_blur(map, scratch, rows, columns, sigma);
+        double sigma = f->desc.sigma > 0 ? (double)f->desc.sigma : gphi_choose_sigma(f, v, map, scratch);
+        gphi_blur(map, scratch, rows, columns, sigma);
     } else if (f->desc.repair == GPH_REPAIR_PYRAMID)
         gphi_pyramid(map, NULL, rows, columns, (int)f->desc.pyramid_levels);
     else if (f->desc.repair == GPH_REPAIR_PULL_PUSH)
@@ -2305,25 +2353,45 @@ static uint16_t gphi_half(float x)
     return (uint16_t)((bits + 0x1000u - (112u << 23)) >> 13);
 }
 
-/* Sums of every 8 weights from the start. Returns the sum of all. */
-static uint64_t gphi_sum_weights(const uint16_t *weights, uint32_t bins, uint64_t *sums)
+/* Parts of a map. */
+static uint64_t *gphi_map_blocks(unsigned char *map, uint32_t rows)
 {
-    uint64_t sum = 0;
-    uint32_t i;
-    for (i = 0; i < bins; ++i) {
-        if (i % 8 == 0)
-            sums[i / 8] = sum;
-        sum += gph_weight(weights[i]);
+    return (uint64_t *)(void *)map + ((rows + 8) & ~7u);
+}
+static uint16_t *gphi_map_weights(unsigned char *map, uint32_t rows)
+{
+    return (uint16_t *)(void *)(gphi_map_blocks(map, rows) + rows * rows / 4);
+}
+
+/* Sums of the weights before each row and each 8 bins. compare: tell whether they are there already, and write
+   nothing. */
+static bool gphi_sum_weights(unsigned char *map, uint32_t rows, bool compare)
+{
+    uint64_t *sums = (uint64_t *)(void *)map, *blocks = gphi_map_blocks(map, rows), sum = 0;
+    const uint16_t *weights = gphi_map_weights(map, rows);
+    uint32_t i, bins = rows * rows * 2;
+    bool same = true;
+    for (i = 0; i <= bins; ++i) {
+        uint64_t *to[2];
+        int k;
+        to[0] = i % (2 * rows) == 0 ? &sums[i / (2 * rows)] : NULL;
+        to[1] = i % 8 == 0 && i < bins ? &blocks[i / 8] : NULL;
+        for (k = 0; k < 2; ++k)
+            if (to[k]) {
+                same = same && *to[k] == sum;
+                *to[k] = compare ? *to[k] : sum;
+            }
+        sum += i < bins ? gph_weight(weights[i]) : 0;
     }
-    return sums[bins / 8] = sum;
+    return same && sum > 0;
 }
 
 /* A map of values >= 0 as weights whose largest is 2^15, with their sums. False, and nothing written, without light. */
-static bool gphi_write_map(unsigned char *to, const float *map, uint32_t bins)
+static bool gphi_write_map(unsigned char *to, const float *map, uint32_t rows)
 {
-    uint16_t *weights = (uint16_t *)(void *)to;
+    uint16_t *weights = gphi_map_weights(to, rows);
     double most = 0, scale;
-    uint32_t i;
+    uint32_t i, bins = rows * rows * 2;
     for (i = 0; i < bins; ++i)
         most = (double)map[i] > most ? (double)map[i] : most;
     if (!(most > 0 && most < INFINITY))
@@ -2331,7 +2399,7 @@ static bool gphi_write_map(unsigned char *to, const float *map, uint32_t bins)
     scale = 32768 / most;
     for (i = 0; i < bins; ++i)
         weights[i] = map[i] > 0 ? gphi_half((float)fmin((double)map[i] * scale, 32768)) : 0;
-    gphi_sum_weights(weights, bins, (uint64_t *)(void *)(to + bins * sizeof *weights));
+    gphi_sum_weights(to, rows, false);
     return true;
 }
 
@@ -2407,7 +2475,7 @@ static void gphi_publish_maps(void *context, uint32_t begin, uint32_t end)
             memcpy(gphi_block_map(p->block, out->map), gphi_block_map(f->block, v->s.map), f->map_bytes);
         else {
             gphi_repair_map(f, v, map, scratch);
-            gphi_write_map(gphi_block_map(p->block, out->map), map, f->bins); /* lit: photons have flux > 0 */
+            gphi_write_map(gphi_block_map(p->block, out->map), map, f->desc.rows); /* lit: photons have flux > 0 */
         }
         out->alpha = v->s.verdict == GPH_GATE_CLOSED ? 1.0f : v->s.alpha;
     }
@@ -2671,7 +2739,7 @@ GPH_API gph_result gph_resolve(const gph_desc *desc, gph_desc *resolved)
 static void gphi_field_options(gph_field *f)
 {
     f->bins = f->desc.rows * f->desc.rows * 2;
-    f->map_bytes = f->bins * 2 + (f->bins / 8 + 1) * 8;
+    f->map_bytes = ((f->desc.rows + 8) & ~7u) * 8 + f->bins + f->bins * 2;
 }
 
 GPH_API gph_result gph_create(const gph_desc *desc, gph_field **field)
@@ -2787,8 +2855,8 @@ static void gphi_import_some(void *context, uint32_t begin, uint32_t end)
     for (i = begin; i < end; ++i) {
         uint32_t v = p->voxels[i], map = v < p->field->voxel_count ? p->field->voxels[v].s.map : GPH_NONE;
         if (map != GPH_NONE)
-            p->taken[i % 4096] = gphi_write_map(gphi_block_map(p->field->block, map),
-                                                p->maps + (size_t)i * p->field->bins, p->field->bins);
+            p->taken[i] = gphi_write_map(gphi_block_map(p->field->block, map), p->maps + (size_t)i * p->field->bins,
+                                         p->field->desc.rows);
     }
 }
 
@@ -2850,10 +2918,12 @@ GPH_API void gph_find_batch(const gph_view *view, uint32_t count, const uint32_t
 GPH_API void gph_sample_batch(const gph_view *view, uint32_t count, const uint32_t *index, const gph_handle *handles,
                               const float *u, size_t u_stride, float *directions, size_t direction_stride, float *pdf)
 {
-    uint32_t k;
-    (void)view;
+    uint32_t k, j;
     for (k = 0; k < count; ++k) {
-        uint32_t i = index ? index[k] : k;
+        uint32_t i = index ? index[k] : k, ahead = k + 6 < count ? (index ? index[k + 6] : k + 6) : i;
+        if (handles[ahead].weights) /* maps lie anywhere in memory */
+            for (j = 0; j <= view->rows; j += 8)
+                GPHI_PREFETCH(handles[ahead].sums + j);
         pdf[i] = gph_sample(&handles[i], gphi_row(u, u_stride, i),
                             (float *)(void *)((char *)directions + direction_stride * i));
     }
@@ -3083,18 +3153,14 @@ static gph_result gphi_building_valid(const gph_field *f)
     return ok ? GPH_OK : GPH_CORRUPT;
 }
 
-static bool gphi_map_valid(const unsigned char *map, uint32_t bins)
+static bool gphi_map_valid(unsigned char *map, uint32_t rows)
 {
-    const uint16_t *weights = (const uint16_t *)(const void *)map;
-    const uint64_t *sums = (const uint64_t *)(const void *)(map + bins * sizeof *weights);
-    uint64_t sum = 0;
+    const uint16_t *weights = gphi_map_weights(map, rows);
     uint32_t i;
-    for (i = 0; i < bins; ++i) {
-        if (weights[i] > 0x7800 || (i % 8 == 0 && sums[i / 8] != sum))
+    for (i = 0; i < rows * rows * 2; ++i)
+        if (weights[i] > 0x7800)
             return false;
-        sum += gph_weight(weights[i]);
-    }
-    return sum > 0 && sums[bins / 8] == sum;
+    return gphi_sum_weights(map, rows, true);
 }
 
 /* Shape of the block against its own counts: before anything in it is looked at. */
@@ -3136,7 +3202,7 @@ static gph_result gphi_block_valid(const gph_field *f)
              v->gate <= GPH_GATE_CLOSED && v->level <= 24;
     }
     for (i = 0; ok && i < b->maps; ++i)
-        ok = gphi_map_valid(gphi_block_map(b, i), f->bins);
+        ok = gphi_map_valid(gphi_block_map(b, i), f->desc.rows);
     gphi_release(&f->desc, t.seen);
     return ok ? GPH_OK : GPH_CORRUPT;
 }
