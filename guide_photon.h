@@ -1432,6 +1432,17 @@ static void gphi_batch_unsort(gphi_batch *b)
     b->offsets = NULL;
 }
 
+/* What was counted as accepted finds no memory. */
+static void gphi_lose(gphi_batch *b, uint64_t *accepted)
+{
+    uint32_t i;
+    for (i = 0; i < b->count; ++i)
+        if (b->hits[i].voxel < b->field->voxel_count) {
+            b->field->stats.lost++;
+            --*accepted;
+        }
+}
+
 static bool gphi_position_ok(const float p[3])
 {
     return fabsf(p[0]) < GPHI_MAX_VALUE && fabsf(p[1]) < GPHI_MAX_VALUE && fabsf(p[2]) < GPHI_MAX_VALUE;
@@ -1532,7 +1543,7 @@ static gph_result gphi_take_vertices(gphi_batch *b, const gph_vertex *vertices, 
         f->voxels[*voxel].s.valid = 1;
     }
     if (!gphi_batch_sort(b)) {
-        f->stats.lost += count;
+        gphi_lose(b, &f->stats.vertices);
         return GPH_OUT_OF_MEMORY;
     }
     gphi_run(parallel, user, f->voxel_count, 256, gphi_add_vertices, b);
@@ -1614,13 +1625,15 @@ static gph_result gphi_take_hits(gphi_batch *b, gph_parallel_fn parallel, void *
     gph_result result = GPH_OK;
     uint32_t i;
     if (!gphi_batch_sort(b)) {
-        for (i = 0; i < b->count; ++i)
-            f->stats.lost += b->hits[i].voxel < f->voxel_count;
+        gphi_lose(b, &f->stats.photons);
         return GPH_OUT_OF_MEMORY;
     }
-    for (i = 0; i < f->voxel_count; ++i)
-        if (b->offsets[i + 1] > b->offsets[i] && gphi_make_room(f, i, b->offsets[i + 1] - b->offsets[i]))
+    for (i = 0; i < f->voxel_count; ++i) {
+        uint32_t n = b->offsets[i + 1] - b->offsets[i];
+        if (n && gphi_make_room(f, i, n))
             result = GPH_OUT_OF_MEMORY;
+        f->stats.photons -= n && f->voxels[i].s.blocked ? n : 0;
+    }
     gphi_run(parallel, user, f->voxel_count, 64, gphi_add_hits, b);
     gphi_batch_unsort(b);
     return result;
@@ -1661,8 +1674,10 @@ static gph_result gphi_settle(gphi_batch *b, const float *positions, size_t stri
         gphi_batch other;
         if (gphi_join_cloud(b, positions, stride))
             return GPH_OK;
-        if (!gphi_batch_make(&other, f))
+        if (!gphi_batch_make(&other, f)) {
+            gphi_lose(b, &f->stats.photons);
             return GPH_OUT_OF_MEMORY;
+        }
         close = gphi_close_cloud(&other, parallel, user);
         gphi_release(&f->desc, other.hits);
         for (i = 0; i < b->count; ++i) /* its voxel may have been cut */
@@ -1735,8 +1750,11 @@ GPH_API gph_result gph_accumulate(gph_field *field, gph_stream *const *streams, 
     if (!(field->side > 0))
         gphi_discover_box(field, streams, count);
     if (!gphi_batch_make(&b, field)) {
-        for (i = 0; i < count; ++i)
+        for (i = 0; i < count; ++i) {
             field->stats.lost += gph_stream_size(streams[i]);
+            gphi_count_lost(field, &streams[i]->vertices);
+            gphi_count_lost(field, &streams[i]->photons);
+        }
         return GPH_OUT_OF_MEMORY;
     }
     for (i = 0; i < 2 * count; ++i) {
@@ -3293,8 +3311,8 @@ static bool gphi_header_valid(const gphi_header *h, const gph_desc *d)
 {
     int k;
     bool ok = h->voxels <= GPHI_MAX_VOXELS && h->nodes <= 2 * h->voxels && h->cubes <= h->voxels &&
-              h->cloud <= d->cloud_photons && h->cloud_closed <= 1 && h->side >= 0 && h->side < 1e31 &&
-              (h->side > 0 || h->voxels == 0);
+              h->cloud <= d->cloud_photons && h->cloud_closed <= 1 && h->stats.passes < 1u << 30 && h->side >= 0 &&
+              h->side < 1e31 && (h->side > 0 || h->voxels == 0);
     for (k = 0; k < 3; ++k)
         ok = ok && fabs(h->origin[k]) < 1e31;
     return ok && gphi_within_float(h->stats.closed_share, 0, 1) && gphi_within_float(h->stats.mean_alpha, 0, 1) &&
