@@ -34,7 +34,7 @@ AR ?= ar
 
 release_FLAGS := -O3 -DNDEBUG
 debug_FLAGS := -O0 -g
-scalar_FLAGS := -O2 -g -DGSD_NO_SIMD -DGKD_NO_SIMD
+scalar_FLAGS := -O2 -g -DGSD_NO_SIMD -DGKD_NO_SIMD -DGNN_NO_SIMD
 sanitize_FLAGS := -O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=undefined
 tsan_FLAGS := -O1 -g -fno-omit-frame-pointer -fsanitize=thread
 coverage_FLAGS := -O0 -g --coverage
