@@ -197,6 +197,123 @@ GNN_API void gnn_conv_backward(const gnn_conv *conv, const float *weights, const
                                const gnn_conv_maps *maps, float *dout, float *dup, float *din, float *dadd,
                                float *dweights, float *scratch);
 
+/* [any thread] Masks [height][width] of maps without halo, 1 = valid, 0 = not. scale = 9 / (valid pixels of the 3x3
+   around) and grown = 1 where there is one, both 0 elsewhere: a partial convolution is gnn_conv_forward of a map that
+   is 0 where it is not valid, with that scale (Liu et al. 2018, eqs. 1, 2). The result is valid where grown is. */
+GNN_API void gnn_mask_grow(const float *mask, uint32_t width, uint32_t height, float *scale, float *grown);
+/* [any thread] Means of 2x2 pixels: to is half as wide and high; halo written. width and height: of `from`, even,
+   width / 2 even too. */
+GNN_API void gnn_pool(const float *from, uint32_t width, uint32_t height, uint32_t stride, float *to);
+/* [any thread] dfrom += gradient, from that by `to`. */
+GNN_API void gnn_pool_backward(const float *dto, uint32_t width, uint32_t height, uint32_t stride, float *dfrom);
+/* [any thread] One step of Adam (Kingma and Ba 2015, algorithm 1). first, second: moments, zero before step 1. */
+GNN_API void gnn_adam(float *weights, const float *gradients, float *first, float *second, size_t count, uint64_t step,
+                      float rate, float beta1, float beta2, float epsilon);
+/* [any thread] Mean over pixels of |out - truth| (1 + (lambda - 1) H), H = 1 where out and input lie on different sides
+   of truth (Zhu et al. 2021, eqs. 12, 13). dout = its gradient, times `weight`; may be NULL. */
+GNN_API double gnn_loss(const float *out, const float *input, const float *truth, size_t count, float lambda,
+                        float weight, float *dout);
+
+/* ---- >>unet ------------------------------------------------------------------------------------------------- */
+
+#define GNN_MAX_LEVELS 6
+#define GNN_MAX_INPUTS 16
+
+/* The network that repairs histograms of photons (Zhu et al. 2021, section 6), as compact as its levels say:
+     level l, going down:  a = relu(conv(x)), y = relu(conv(a) + a), masked; x = the input, below it the pooled y above
+     going up:             a = relu(conv(upsampled level below, y of this level)), y = relu(conv(a) + a)
+     output:               1x1 convolution of the top y, plus input 0
+   While training, 1x1 convolutions of the levels between give outputs of their own, judged by the pooled truth.
+   Zero-initialise it; zero means the default. */
+typedef struct gnn_unet_desc {
+    uint32_t width, height;            /* directions: columns are phi, rows z; default 64 x 32. height a multiple of
+                                          2^(levels - 1), width of 2^levels; <= 1024 */
+    uint32_t inputs;                   /* maps, 1 .. 16; default 5: S_t, S_t-1, P_t, P_t-1, B_t. Input 0 is repaired */
+    uint32_t levels;                   /* 1 .. 6; default 3 */
+    uint32_t channels[GNN_MAX_LEVELS]; /* of each level, 1 .. 512; default 8, 16, 32, ... */
+    bool no_mask;                      /* else the last input is the mask: pixels where it is <= 0 are not valid */
+    bool training;                     /* keep what gnn_unet_train needs: two more floats a parameter */
+    float lambda;                      /* of the loss, see gnn_loss, 1 .. 100; default 1.5 */
+    float deep;         /* weight of the losses of levels below the top, 0 .. 100, -1 = 0; default 0.25 */
+    float rate;         /* of Adam, 1e-8 .. 1; default 0.001 */
+    float beta1, beta2; /* of Adam, 0 .. 0.99999; default 0.9, 0.999 */
+    gnn_simd simd;      /* default: the best that this machine has */
+    void *(*allocate)(void *user, size_t size); /* default malloc; NULL on failure; 16-byte aligned */
+    void (*release)(void *user, void *pointer); /* default free; pointer may be NULL */
+    void *user;
+} gnn_unet_desc;
+
+typedef struct gnn_unet gnn_unet;
+
+/* [any thread] Fills in defaults and checks. */
+GNN_API gnn_result gnn_unet_resolve(gnn_unet_desc *desc);
+/* [any thread] All memory that the network ever takes is allocated here; weights are those of gnn_unet_seed(net, 1). */
+GNN_API gnn_result gnn_unet_create(const gnn_unet_desc *desc, gnn_unet **net);
+/* [exclusive] net may be NULL. */
+GNN_API void gnn_unet_destroy(gnn_unet *net);
+/* [any thread] What create has resolved. */
+GNN_API gnn_unet_desc gnn_unet_get_desc(const gnn_unet *net);
+/* [any thread] Weights that training changes. */
+GNN_API uint64_t gnn_unet_parameters(const gnn_unet *net);
+/* [any thread] Floating-point operations of one map as the definition counts them: 2 for each weight and pixel. */
+GNN_API double gnn_unet_operations(const gnn_unet *net);
+/* [exclusive] Random weights (He et al. 2015), the same on every machine; training begins anew. */
+GNN_API void gnn_unet_seed(gnn_unet *net, uint64_t seed);
+
+/* [any thread] Bytes of workspace for `maps` maps at once, to run or to train. More maps than fit at once are worked
+   on one group after the other, with the same result; a group's maps are what can run in parallel. */
+GNN_API size_t gnn_unet_workspace(const gnn_unet *net, uint32_t maps, bool train);
+/* [any thread] (a workspace of its own for each call) inputs[count][inputs][height][width] to
+   outputs[count][height][width]. Outputs can be negative. NaN and infinity in a map's input stay in that map. No
+   allocation. parallel = NULL: serially; the result is the same, bit for bit. */
+GNN_API gnn_result gnn_unet_forward(const gnn_unet *net, const float *inputs, uint32_t count, float *outputs,
+                                    void *workspace, size_t size, gnn_parallel_fn parallel, void *parallel_user);
+
+/* What a training step saw. */
+typedef struct gnn_step {
+    double loss;      /* mean over the maps that counted, of the sum over levels; 0 where none did */
+    uint32_t maps;    /* that counted */
+    uint32_t refused; /* maps whose loss or gradient is not finite: they do not count; best 0 */
+} gnn_step;
+
+/* [any thread] Mean gradient over maps by all weights, in the network's order (gnn_unet_floats of them, see
+   gnn_unet_tensor_export). truths[count][height][width]. */
+GNN_API gnn_result gnn_unet_gradients(const gnn_unet *net, const float *inputs, const float *truths, uint32_t count,
+                                      float *gradients, gnn_step *step, void *workspace, size_t size,
+                                      gnn_parallel_fn parallel, void *parallel_user);
+/* [exclusive] gnn_unet_gradients, then one step of Adam (none if no map counted). desc.training must be set. */
+GNN_API gnn_result gnn_unet_train(gnn_unet *net, const float *inputs, const float *truths, uint32_t count,
+                                  gnn_step *step, void *workspace, size_t size, gnn_parallel_fn parallel,
+                                  void *parallel_user);
+/* [exclusive] The learning rate from now on. */
+GNN_API void gnn_unet_set_rate(gnn_unet *net, float rate);
+
+/* Tensors have PyTorch's shapes and are named down0.conv1.weight, down0.conv1.bias, down0.conv2.weight, ...,
+   up0.conv1.weight, ..., head0.weight, ... */
+/* [any thread] */
+GNN_API uint32_t gnn_unet_tensors(const gnn_unet *net);
+/* [any thread] Name (terminated), rank, shape; returns the number of values. */
+GNN_API uint64_t gnn_unet_tensor(const gnn_unet *net, uint32_t index, char name[40], uint32_t *rank,
+                                 uint64_t shape[GNN_MAX_RANK]);
+/* [any thread] Floats in the network's own order, padding included. */
+GNN_API size_t gnn_unet_floats(const gnn_unet *net);
+/* [any thread] The values of a tensor out of such floats; NULL = the weights. */
+GNN_API void gnn_unet_tensor_export(const gnn_unet *net, const float *floats, uint32_t index, float *values);
+/* [exclusive] Sets a tensor's values. */
+GNN_API void gnn_unet_tensor_import(gnn_unet *net, uint32_t index, const float *values);
+
+/* [exclusive] Weights out of a safetensors file in memory, by name; other tensors of the file do not matter. If the
+   file has what gnn_unet_save kept for training and desc.training is set, training goes on where it was. On failure
+   the network is as it was, and message (may be NULL) names the tensor. Safe for untrusted input. Allocates a table of
+   the file's tensors for the time of the call. */
+GNN_API gnn_result gnn_unet_load(gnn_unet *net, const void *file, size_t size, gnn_message *message);
+/* [any thread] Bytes that gnn_unet_save writes; 0 = out of memory. type F16 or F32; F32 of a network for training keeps
+   all that training needs to go on. metadata: see gnn_tensors_bound; may be NULL. */
+GNN_API size_t gnn_unet_bound(const gnn_unet *net, gnn_type type, const char *const *metadata);
+/* [any thread] Allocates a copy of the weights for the time of the call. */
+GNN_API gnn_result gnn_unet_save(const gnn_unet *net, gnn_type type, const char *const *metadata, void *buffer,
+                                 size_t size, size_t *written);
+
 #ifdef __cplusplus
 }
 #endif
@@ -1568,6 +1685,1050 @@ GNN_API gnn_result gnn_tensors_write(const gnn_weight *weights, uint32_t count, 
         }
     *written = at;
     return GNN_OK;
+}
+
+/* ---- >>parts ------------------------------------------------------------------------------------------------ */
+
+GNN_API void gnn_mask_grow(const float *mask, uint32_t width, uint32_t height, float *scale, float *grown)
+{
+    uint32_t x, y, k;
+    for (y = 0; y < height; ++y) {
+        const float *row[3];
+        uint32_t turn[3];
+        for (k = 0; k < 3; ++k) { /* rows y - 1, y, y + 1; turned by half beyond a pole */
+            int64_t at = (int64_t)(y + k) - 1;
+            turn[k] = at < 0 || at >= height ? width / 2 : 0;
+            row[k] = mask + (size_t)(at < 0 ? 0 : at >= height ? height - 1 : at) * width;
+        }
+        for (x = 0; x < width; ++x) {
+            float count = 0;
+            for (k = 0; k < 3; ++k) {
+                uint32_t middle = x + turn[k], left, right;
+                middle = middle >= width ? middle - width : middle;
+                left = middle ? middle - 1 : width - 1;
+                right = middle + 1 < width ? middle + 1 : 0;
+                count += row[k][left] + row[k][middle] + row[k][right];
+            }
+            scale[(size_t)y * width + x] = count > 0 ? 9 / count : 0;
+            if (grown)
+                grown[(size_t)y * width + x] = count > 0 ? 1.0f : 0.0f;
+        }
+    }
+}
+
+GNN_API void gnn_pool(const float *from, uint32_t width, uint32_t height, uint32_t stride, float *to)
+{
+    uint32_t x, y, c;
+    for (y = 0; y < height / 2; ++y)
+        for (x = 0; x < width / 2; ++x) {
+            const float *a = from + gnni_at(width, stride, 2 * (int64_t)x, 2 * (int64_t)y);
+            const float *b = a + (size_t)(width + 2) * stride;
+            float *mean = to + gnni_at(width / 2, stride, x, y);
+            for (c = 0; c < stride; ++c)
+                mean[c] = 0.25f * ((a[c] + a[stride + c]) + (b[c] + b[stride + c]));
+        }
+    gnn_map_halo(to, width / 2, height / 2, stride);
+}
+
+GNN_API void gnn_pool_backward(const float *dto, uint32_t width, uint32_t height, uint32_t stride, float *dfrom)
+{
+    uint32_t x, y, c;
+    for (y = 0; y < height; ++y)
+        for (x = 0; x < width; ++x) {
+            const float *d = dto + gnni_at(width / 2, stride, x / 2, y / 2);
+            float *to = dfrom + gnni_at(width, stride, x, y);
+            for (c = 0; c < stride; ++c)
+                to[c] += 0.25f * d[c];
+        }
+}
+
+GNN_API void gnn_adam(float *weights, const float *gradients, float *first, float *second, size_t count, uint64_t step,
+                      float rate, float beta1, float beta2, float epsilon)
+{
+    float correct1 = (float)(1 / (1 - pow((double)beta1, (double)step)));
+    float correct2 = (float)(1 / (1 - pow((double)beta2, (double)step)));
+    size_t i;
+    for (i = 0; i < count; ++i) {
+        float g = gradients[i];
+        first[i] = beta1 * first[i] + (1 - beta1) * g;
+        second[i] = beta2 * second[i] + (1 - beta2) * g * g;
+        weights[i] -= rate * (first[i] * correct1) / (sqrtf(second[i] * correct2) + epsilon);
+    }
+}
+
+GNN_API double gnn_loss(const float *out, const float *input, const float *truth, size_t count, float lambda,
+                        float weight, float *dout)
+{
+    double sum = 0;
+    float share = weight / (float)count;
+    size_t i;
+    for (i = 0; i < count; ++i) {
+        float away = out[i] - truth[i], before = input[i] - truth[i];
+        float w = (away > 0 && before < 0) || (away < 0 && before > 0) ? lambda : 1;
+        sum += (double)(w * fabsf(away));
+        if (dout)
+            dout[i] = away > 0 ? w * share : away < 0 ? -w * share : 0;
+    }
+    return sum / (double)count;
+}
+
+/* ---- >>net -------------------------------------------------------------------------------------------------- */
+
+#define GNNI_ALIGN(n) (((n) + 15) & ~(size_t)15) /* floats of a cache line */
+#define GNNI_HEAD 8                              /* columns that a head's one output is computed in */
+
+static void *gnni_default_allocate(void *user, size_t size)
+{
+    (void)user;
+    return GNN_MALLOC(size);
+}
+
+static void gnni_default_release(void *user, void *pointer)
+{
+    (void)user;
+    GNN_FREE(pointer);
+}
+
+/* A convolution of the network: where its weights and what is prepared of them lie. */
+typedef struct gnni_layer {
+    gnn_conv conv;
+    size_t weights, prepared;
+} gnni_layer;
+
+/* Where a map's data lie in its part of the workspace, in floats. Offsets of gradients are those of the maps. */
+typedef struct gnni_places {
+    size_t input, x[GNN_MAX_LEVELS]; /* x: what a level begins with; 0 unused */
+    size_t a[GNN_MAX_LEVELS], y[GNN_MAX_LEVELS], up_a[GNN_MAX_LEVELS], up_y[GNN_MAX_LEVELS];
+    size_t maps;                                                 /* all of the above: end of what has gradients */
+    size_t mask, scale1[GNN_MAX_LEVELS], scale2[GNN_MAX_LEVELS]; /* mask: two planes */
+    size_t head, out, plain, truth, dout;                        /* planes of one level; head: a row of the product */
+    size_t scratch, gradients, weights, total;                   /* gradients: of maps; weights: gradients of weights */
+} gnni_places;
+
+struct gnn_unet {
+    gnn_unet_desc desc;
+    gnni_layer down[GNN_MAX_LEVELS][2], up[GNN_MAX_LEVELS][2];
+    size_t heads[GNN_MAX_LEVELS]; /* [stride][8], then [8] biases */
+    size_t floats, prepared_floats, scratch;
+    gnni_places run, train;
+    uint64_t step;
+    float *weights, *prepared, *first, *second, *gradients;
+};
+
+static uint32_t gnni_ups(const gnn_unet *n) { return n->desc.levels - 1; }
+
+/* Heads: of the top, and of the levels between it and the lowest. */
+static uint32_t gnni_heads(const gnn_unet *n) { return n->desc.levels > 1 ? n->desc.levels - 1 : 1; }
+
+static bool gnni_within(double x, double low, double high) { return x >= low && x <= high; }
+
+static void gnni_default(float *x, float value) { *x = *x != 0 ? *x : value; }
+
+GNN_API gnn_result gnn_unet_resolve(gnn_unet_desc *d)
+{
+    uint32_t l;
+    d->width = d->width ? d->width : 64;
+    d->height = d->height ? d->height : 32;
+    d->inputs = d->inputs ? d->inputs : 5;
+    d->levels = d->levels ? d->levels : 3;
+    if (d->inputs > GNN_MAX_INPUTS || d->levels > GNN_MAX_LEVELS)
+        return GNN_BAD_RANGE;
+    for (l = 0; l < d->levels; ++l) {
+        d->channels[l] = d->channels[l] ? d->channels[l] : l ? 2 * d->channels[l - 1] : 8;
+        if (d->channels[l] > 512)
+            return GNN_BAD_RANGE;
+    }
+    if (d->width > 1024 || d->height > 1024 || d->width % (1u << d->levels) || d->height % (1u << (d->levels - 1)))
+        return GNN_BAD_SHAPE;
+    gnni_default(&d->lambda, 1.5f);
+    gnni_default(&d->deep, 0.25f);
+    gnni_default(&d->rate, 0.001f);
+    gnni_default(&d->beta1, 0.9f);
+    gnni_default(&d->beta2, 0.999f);
+    if (!gnni_within(d->lambda, 1, 100) || !(d->deep == -1 || gnni_within(d->deep, 0, 100)) ||
+        !gnni_within(d->rate, 1e-8, 1) || !gnni_within(d->beta1, 0, 0.99999) || !gnni_within(d->beta2, 0, 0.99999))
+        return GNN_BAD_RANGE;
+    d->simd = gnn_resolve_simd(d->simd);
+    if (d->simd == GNN_SIMD_AUTO)
+        return GNN_BAD_OPTION;
+    if (!d->allocate != !d->release)
+        return GNN_BAD_ALLOCATOR;
+    if (!d->allocate) {
+        d->allocate = gnni_default_allocate;
+        d->release = gnni_default_release;
+    }
+    return GNN_OK;
+}
+
+/* Plans a layer and gives it its place. */
+static void gnni_layer_plan(gnn_unet *n, gnni_layer *layer, uint32_t level, uint32_t up, uint32_t in,
+                            uint32_t in_stride)
+{
+    gnn_conv *c = &layer->conv;
+    size_t scratch;
+    memset(c, 0, sizeof *c);
+    c->width = n->desc.width >> level;
+    c->height = n->desc.height >> level;
+    c->up = up;
+    c->up_stride = gnn_stride(up);
+    c->in = in;
+    c->in_stride = in_stride;
+    c->out = n->desc.channels[level];
+    c->out_stride = gnn_stride(c->out);
+    c->relu = true;
+    c->simd = n->desc.simd;
+    layer->weights = n->floats;
+    layer->prepared = n->prepared_floats;
+    n->floats += GNNI_ALIGN(gnn_conv_weights(c));
+    n->prepared_floats += GNNI_ALIGN(gnn_conv_prepared(c));
+    scratch = gnn_conv_scratch(c);
+    n->scratch = scratch > n->scratch ? scratch : n->scratch;
+}
+
+static void gnni_plan_layers(gnn_unet *n)
+{
+    const gnn_unet_desc *d = &n->desc;
+    uint32_t l;
+    for (l = 0; l < d->levels; ++l) {
+        uint32_t in = l ? d->channels[l - 1] : d->inputs;
+        gnni_layer_plan(n, &n->down[l][0], l, 0, in, l ? gnn_stride(in) : in); /* the input is not padded: nobody asks
+                                                                                 for its gradient */
+        gnni_layer_plan(n, &n->down[l][1], l, 0, d->channels[l], gnn_stride(d->channels[l]));
+    }
+    for (l = 0; l < gnni_ups(n); ++l) {
+        gnni_layer_plan(n, &n->up[l][0], l, d->channels[l + 1], d->channels[l], gnn_stride(d->channels[l]));
+        gnni_layer_plan(n, &n->up[l][1], l, 0, d->channels[l], gnn_stride(d->channels[l]));
+    }
+    for (l = 0; l < gnni_heads(n); ++l) {
+        n->heads[l] = n->floats;
+        n->floats += GNNI_ALIGN(((size_t)gnn_stride(d->channels[l]) + 1) * GNNI_HEAD);
+    }
+}
+
+static size_t gnni_place(size_t *end, size_t floats)
+{
+    size_t at = *end;
+    *end += GNNI_ALIGN(floats);
+    return at;
+}
+
+/* To run, the way up overwrites the maps of the way down that it has read; to train all of them stay. */
+static void gnni_plan_places(gnn_unet *n, gnni_places *p, bool train)
+{
+    const gnn_unet_desc *d = &n->desc;
+    size_t end = 0, area = (size_t)d->width * d->height;
+    uint32_t l;
+    memset(p, 0, sizeof *p);
+    p->input = gnni_place(&end, gnn_map_floats(d->width, d->height, d->inputs));
+    for (l = 0; l < d->levels; ++l) {
+        uint32_t w = d->width >> l, h = d->height >> l;
+        size_t map = gnn_map_floats(w, h, gnn_stride(d->channels[l]));
+        p->x[l] = l ? gnni_place(&end, gnn_map_floats(w, h, gnn_stride(d->channels[l - 1]))) : p->input;
+        p->a[l] = gnni_place(&end, map);
+        p->y[l] = gnni_place(&end, map);
+        p->up_a[l] = train && l < gnni_ups(n) ? gnni_place(&end, map) : p->a[l];
+        p->up_y[l] = train && l < gnni_ups(n) ? gnni_place(&end, map) : p->y[l];
+    }
+    p->maps = end;
+    p->mask = gnni_place(&end, 2 * area);
+    for (l = 0; l < d->levels; ++l) {
+        p->scale1[l] = gnni_place(&end, area >> 2 * l);
+        p->scale2[l] = gnni_place(&end, area >> 2 * l);
+    }
+    p->head = gnni_place(&end, (size_t)d->width * GNNI_HEAD);
+    p->out = gnni_place(&end, area);
+    p->plain = gnni_place(&end, area);
+    p->truth = gnni_place(&end, train ? area : 0);
+    p->dout = gnni_place(&end, train ? area : 0);
+    p->scratch = gnni_place(&end, n->scratch);
+    p->gradients = gnni_place(&end, train ? p->maps : 0);
+    p->weights = gnni_place(&end, train ? n->floats : 0);
+    p->total = end + 16; /* one more cache line, so that maps of equal place do not fall on equal sets */
+}
+
+static void gnni_prepare(gnn_unet *n)
+{
+    uint32_t l, k;
+    for (l = 0; l < n->desc.levels; ++l)
+        for (k = 0; k < 2; ++k) {
+            const gnni_layer *down = &n->down[l][k], *up = &n->up[l][k];
+            gnn_conv_prepare(&down->conv, n->weights + down->weights, n->prepared + down->prepared);
+            if (l < gnni_ups(n))
+                gnn_conv_prepare(&up->conv, n->weights + up->weights, n->prepared + up->prepared);
+        }
+}
+
+GNN_API gnn_result gnn_unet_create(const gnn_unet_desc *desc, gnn_unet **out)
+{
+    gnn_unet_desc d = *desc;
+    gnn_result result = gnn_unet_resolve(&d);
+    gnn_unet *n;
+    size_t floats;
+    *out = NULL;
+    if (result)
+        return result;
+    n = (gnn_unet *)d.allocate(d.user, sizeof *n);
+    if (!n)
+        return GNN_OUT_OF_MEMORY;
+    memset(n, 0, sizeof *n);
+    n->desc = d;
+    gnni_plan_layers(n);
+    gnni_plan_places(n, &n->run, false);
+    gnni_plan_places(n, &n->train, true);
+    floats = n->floats * (d.training ? 4 : 1) + n->prepared_floats;
+    n->weights = (float *)d.allocate(d.user, floats * sizeof(float));
+    if (!n->weights) {
+        d.release(d.user, n);
+        return GNN_OUT_OF_MEMORY;
+    }
+    n->prepared = n->weights + n->floats;
+    n->first = n->prepared + n->prepared_floats;
+    n->second = n->first + n->floats;
+    n->gradients = n->second + n->floats;
+    memset(n->weights, 0, floats * sizeof(float));
+    gnn_unet_seed(n, 1);
+    *out = n;
+    return GNN_OK;
+}
+
+GNN_API void gnn_unet_destroy(gnn_unet *n)
+{
+    gnn_unet_desc d;
+    if (!n)
+        return;
+    d = n->desc;
+    d.release(d.user, n->weights);
+    d.release(d.user, n);
+}
+
+GNN_API gnn_unet_desc gnn_unet_get_desc(const gnn_unet *n) { return n->desc; }
+GNN_API size_t gnn_unet_floats(const gnn_unet *n) { return n->floats; }
+GNN_API void gnn_unet_set_rate(gnn_unet *n, float rate) { n->desc.rate = rate; }
+
+/* ---- >>named ------------------------------------------------------------------------------------------------ */
+
+/* Tensors: two of each convolution down, up, then of each head. */
+typedef struct gnni_named {
+    const gnni_layer *layer; /* NULL: a head */
+    size_t head;
+    uint32_t channels; /* of the head's level */
+    bool bias;
+} gnni_named;
+
+GNN_API uint32_t gnn_unet_tensors(const gnn_unet *n)
+{
+    return 4 * n->desc.levels + 4 * gnni_ups(n) + 2 * gnni_heads(n);
+}
+
+static gnni_named gnni_tensor_of(const gnn_unet *n, uint32_t index)
+{
+    gnni_named t;
+    uint32_t down = 4 * n->desc.levels, up = 4 * gnni_ups(n);
+    memset(&t, 0, sizeof t);
+    t.bias = index & 1;
+    if (index < down) {
+        t.layer = &n->down[index / 4][index / 2 % 2];
+    } else if (index < down + up) {
+        t.layer = &n->up[(index - down) / 4][(index - down) / 2 % 2];
+    } else {
+        index = (index - down - up) / 2;
+        t.head = n->heads[index];
+        t.channels = n->desc.channels[index];
+    }
+    return t;
+}
+
+/* Writes text after what is there, number too where it is >= 0. */
+static void gnni_name(char name[40], const char *text, int number)
+{
+    size_t at = strlen(name);
+    memcpy(name + at, text, strlen(text));
+    at += strlen(text);
+    if (number >= 0)
+        name[at++] = (char)('0' + number);
+    name[at] = 0;
+}
+
+GNN_API uint64_t gnn_unet_tensor(const gnn_unet *n, uint32_t index, char name[40], uint32_t *rank,
+                                 uint64_t shape[GNN_MAX_RANK])
+{
+    gnni_named t = gnni_tensor_of(n, index);
+    uint32_t down = 4 * n->desc.levels, up = 4 * gnni_ups(n);
+    uint32_t in = t.layer ? t.layer->conv.up + t.layer->conv.in : t.channels, side = t.layer ? 3 : 1;
+    name[0] = 0;
+    if (t.layer) {
+        gnni_name(name, index < down ? "down" : "up", (int)(index < down ? index / 4 : (index - down) / 4));
+        gnni_name(name, ".conv", (int)(index / 2 % 2 + 1));
+    } else {
+        gnni_name(name, "head", (int)((index - down - up) / 2));
+    }
+    gnni_name(name, t.bias ? ".bias" : ".weight", -1);
+    memset(shape, 0, GNN_MAX_RANK * sizeof *shape);
+    *rank = t.bias ? 1 : 4;
+    shape[0] = t.layer ? t.layer->conv.out : 1;
+    if (t.bias)
+        return shape[0];
+    shape[1] = in;
+    shape[2] = shape[3] = side;
+    return shape[0] * in * side * side;
+}
+
+/* The place of a value of a tensor, PyTorch's order, in the network's. */
+static size_t gnni_value_at(const gnni_named *t, size_t i)
+{
+    const gnn_conv *c;
+    size_t in, o, channel, tap;
+    if (!t->layer)
+        return t->head + (t->bias ? (size_t)gnn_stride(t->channels) : i) * GNNI_HEAD;
+    c = &t->layer->conv;
+    if (t->bias)
+        return t->layer->weights + gnni_up_weights(c) + gnni_in_weights(c) + i;
+    in = c->up + c->in;
+    tap = i % 9;
+    channel = i / 9 % in;
+    o = i / 9 / in;
+    if (channel < c->up)
+        return t->layer->weights + (tap * c->up_stride + channel) * c->out_stride + o;
+    return t->layer->weights + gnni_up_weights(c) + (tap * c->in_stride + channel - c->up) * c->out_stride + o;
+}
+
+static uint64_t gnni_tensor_count(const gnn_unet *n, uint32_t index)
+{
+    char name[40];
+    uint32_t rank;
+    uint64_t shape[GNN_MAX_RANK];
+    return gnn_unet_tensor(n, index, name, &rank, shape);
+}
+
+GNN_API void gnn_unet_tensor_export(const gnn_unet *n, const float *floats, uint32_t index, float *values)
+{
+    gnni_named t = gnni_tensor_of(n, index);
+    size_t i, count = (size_t)gnni_tensor_count(n, index);
+    for (i = 0; i < count; ++i)
+        values[i] = (floats ? floats : n->weights)[gnni_value_at(&t, i)];
+}
+
+static void gnni_import(const gnn_unet *n, float *floats, uint32_t index, const float *values)
+{
+    gnni_named t = gnni_tensor_of(n, index);
+    size_t i, count = (size_t)gnni_tensor_count(n, index);
+    for (i = 0; i < count; ++i)
+        floats[gnni_value_at(&t, i)] = values[i];
+}
+
+GNN_API void gnn_unet_tensor_import(gnn_unet *n, uint32_t index, const float *values)
+{
+    gnni_import(n, n->weights, index, values);
+    gnni_prepare(n);
+}
+
+GNN_API uint64_t gnn_unet_parameters(const gnn_unet *n)
+{
+    uint64_t sum = 0;
+    uint32_t i;
+    for (i = 0; i < gnn_unet_tensors(n); ++i)
+        sum += gnni_tensor_count(n, i);
+    return sum;
+}
+
+static double gnni_layer_operations(const gnni_layer *l)
+{
+    const gnn_conv *c = &l->conv;
+    return 18.0 * c->width * c->height * (c->up + c->in) * c->out;
+}
+
+GNN_API double gnn_unet_operations(const gnn_unet *n)
+{
+    double sum = 2.0 * n->desc.width * n->desc.height * n->desc.channels[0];
+    uint32_t l, k;
+    for (l = 0; l < n->desc.levels; ++l)
+        for (k = 0; k < 2; ++k)
+            sum += gnni_layer_operations(&n->down[l][k]) + (l < gnni_ups(n) ? gnni_layer_operations(&n->up[l][k]) : 0);
+    return sum;
+}
+
+/* A normal deviate from the i-th pair of numbers of a seed (splitmix64, Box and Muller). */
+static float gnni_normal(uint64_t seed, uint64_t i)
+{
+    double u[2];
+    int k;
+    for (k = 0; k < 2; ++k) {
+        uint64_t z = seed * UINT64_C(0xd1342543de82ef95) + (2 * i + (uint64_t)k + 1) * UINT64_C(0x9e3779b97f4a7c15);
+        z = (z ^ (z >> 30)) * UINT64_C(0xbf58476d1ce4e5b9);
+        z = (z ^ (z >> 27)) * UINT64_C(0x94d049bb133111eb);
+        z ^= z >> 31;
+        u[k] = ((double)(z >> 11) + 0.5) * (1.0 / 9007199254740992.0);
+    }
+    return (float)(sqrt(-2 * log(u[0])) * cos(6.283185307179586 * u[1]));
+}
+
+GNN_API void gnn_unet_seed(gnn_unet *n, uint64_t seed)
+{
+    uint32_t i;
+    uint64_t k, drawn = 0;
+    for (i = 0; i < gnn_unet_tensors(n); ++i) {
+        gnni_named t = gnni_tensor_of(n, i);
+        uint64_t count = gnni_tensor_count(n, i);
+        /* heads begin small: the output is then input 0 */
+        float width = t.layer ? sqrtf(2.0f / (9 * (float)(t.layer->conv.up + t.layer->conv.in))) : 0.01f;
+        for (k = 0; k < count; ++k)
+            n->weights[gnni_value_at(&t, (size_t)k)] = t.bias ? 0 : width * gnni_normal(seed, drawn++);
+    }
+    n->step = 0;
+    if (n->desc.training)
+        memset(n->first, 0, 2 * n->floats * sizeof(float));
+    gnni_prepare(n);
+}
+
+/* ---- >>run -------------------------------------------------------------------------------------------------- */
+
+/* A map being worked on: w is its part of the workspace. */
+typedef struct gnni_map {
+    const gnn_unet *net;
+    const gnni_places *at;
+    float *w;
+} gnni_map;
+
+static void gnni_layer_forward(const gnni_map *m, const gnni_layer *l, const float *up, const float *in,
+                               const float *scale, const float *add, float *out)
+{
+    gnn_conv_maps maps;
+    maps.up = up;
+    maps.in = in;
+    maps.scale = scale;
+    maps.add = add;
+    maps.out = out;
+    gnn_conv_forward(&l->conv, m->net->weights + l->weights, m->net->prepared + l->prepared, &maps,
+                     m->w + m->at->scratch);
+}
+
+/* The input as a map, 0 where it is not valid, and the mask. */
+static void gnni_take_input(const gnni_map *m, const float *planes)
+{
+    const gnn_unet_desc *d = &m->net->desc;
+    size_t area = (size_t)d->width * d->height, i;
+    const float *b = planes + (d->inputs - 1) * area;
+    float *map = m->w + m->at->input, *mask = m->w + m->at->mask;
+    uint32_t x, y, c;
+    gnn_map_from_planes(planes, d->width, d->height, d->inputs, d->inputs, map);
+    if (d->no_mask)
+        return;
+    for (i = 0; i < area; ++i)
+        mask[i] = b[i] > 0 ? 1.0f : 0.0f;
+    for (y = 0; y < d->height; ++y)
+        for (x = 0; x < d->width; ++x)
+            for (c = 0; c < d->inputs && mask[(size_t)y * d->width + x] == 0; ++c)
+                map[gnni_at(d->width, d->inputs, x, y) + c] = 0;
+    gnn_map_halo(map, d->width, d->height, d->inputs);
+}
+
+/* Scales of a level's two convolutions; leaves the mask of the next level. */
+static void gnni_level_masks(const gnni_map *m, uint32_t level)
+{
+    const gnn_unet_desc *d = &m->net->desc;
+    uint32_t width = d->width >> level, height = d->height >> level, x, y;
+    float *mask = m->w + m->at->mask, *grown = mask + (size_t)d->width * d->height;
+    gnn_mask_grow(mask, width, height, m->w + m->at->scale1[level], grown);
+    gnn_mask_grow(grown, width, height, m->w + m->at->scale2[level], mask);
+    for (y = 0; y < height / 2; ++y)
+        for (x = 0; x < width / 2; ++x) {
+            const float *from = mask + (size_t)2 * y * width + 2 * x;
+            float any = from[0] + from[1] + from[width] + from[width + 1];
+            mask[(size_t)y * (width / 2) + x] = any > 0 ? 1.0f : 0.0f; /* never ahead of what is read */
+        }
+}
+
+static void gnni_down(const gnni_map *m)
+{
+    const gnn_unet *n = m->net;
+    const gnni_places *at = m->at;
+    uint32_t l;
+    for (l = 0; l < n->desc.levels; ++l) {
+        const gnn_conv *c = &n->down[l][0].conv;
+        const float *scale1 = n->desc.no_mask ? NULL : m->w + at->scale1[l];
+        const float *scale2 = n->desc.no_mask ? NULL : m->w + at->scale2[l];
+        if (!n->desc.no_mask)
+            gnni_level_masks(m, l);
+        if (l)
+            gnn_pool(m->w + at->y[l - 1], 2 * c->width, 2 * c->height, c->in_stride, m->w + at->x[l]);
+        gnni_layer_forward(m, &n->down[l][0], NULL, m->w + at->x[l], scale1, NULL, m->w + at->a[l]);
+        gnni_layer_forward(m, &n->down[l][1], NULL, m->w + at->a[l], scale2, m->w + at->a[l], m->w + at->y[l]);
+    }
+}
+
+static void gnni_up(const gnni_map *m)
+{
+    const gnn_unet *n = m->net;
+    const gnni_places *at = m->at;
+    uint32_t l;
+    for (l = gnni_ups(n); l-- > 0;) {
+        const float *below = m->w + at->up_y[l + 1]; /* of the lowest level: y */
+        gnni_layer_forward(m, &n->up[l][0], below, m->w + at->y[l], NULL, NULL, m->w + at->up_a[l]);
+        gnni_layer_forward(m, &n->up[l][1], NULL, m->w + at->up_a[l], NULL, m->w + at->up_a[l], m->w + at->up_y[l]);
+    }
+}
+
+/* out[height][width] of a level = its head's convolution + plain. */
+static void gnni_head(const gnni_map *m, uint32_t level, const float *plain, float *out)
+{
+    const gnn_unet_desc *d = &m->net->desc;
+    uint32_t width = d->width >> level, height = d->height >> level, stride = gnn_stride(d->channels[level]), x, y;
+    const float *weights = m->net->weights + m->net->heads[level];
+    float *row = m->w + m->at->head, bias = weights[stride * GNNI_HEAD];
+    gnni_product p;
+    memset(&p, 0, sizeof p);
+    p.rows = width;
+    p.columns = GNNI_HEAD;
+    p.c = row;
+    p.c_step = GNNI_HEAD;
+    for (y = 0; y < height; ++y) {
+        p.count = 0;
+        gnni_term_add(&p, m->w + m->at->up_y[level] + gnni_at(width, stride, 0, y), stride, weights, GNNI_HEAD, stride);
+        gnni_multiply(&p, d->simd);
+        for (x = 0; x < width; ++x)
+            out[(size_t)y * width + x] = row[x * GNNI_HEAD] + bias + plain[(size_t)y * width + x];
+    }
+}
+
+/* A workspace cut into parts for maps that are worked on at once. */
+typedef struct gnni_job {
+    const gnn_unet *net;
+    const gnni_places *at;
+    const float *inputs, *truths;
+    float *outputs, *parts, *gradients;
+    uint32_t first, group; /* first map of those that are worked on now, and their number */
+} gnni_job;
+
+GNN_API size_t gnn_unet_workspace(const gnn_unet *n, uint32_t maps, bool train)
+{
+    size_t part = (train ? n->train.total : n->run.total) * sizeof(float);
+    return part * (maps ? maps : 1) + 64;
+}
+
+/* The parts of a workspace: their number, 0 = none fits. */
+static uint32_t gnni_parts(const gnni_places *at, void *workspace, size_t size, float **parts)
+{
+    size_t skip = (64 - ((uintptr_t)workspace & 63)) & 63, count;
+    if (!workspace || size < skip)
+        return 0;
+    *parts = (float *)(void *)((char *)workspace + skip);
+    count = (size - skip) / (at->total * sizeof(float));
+    return count > 0xffffu ? 0xffffu : (uint32_t)count;
+}
+
+static void gnni_run_range(void *context, uint32_t begin, uint32_t end)
+{
+    const gnni_job *j = (const gnni_job *)context;
+    const gnn_unet_desc *d = &j->net->desc;
+    size_t area = (size_t)d->width * d->height;
+    for (; begin < end; ++begin) {
+        const float *input = j->inputs + (size_t)(j->first + begin) * d->inputs * area;
+        gnni_map m;
+        m.net = j->net;
+        m.at = j->at;
+        m.w = j->parts + begin * j->at->total;
+        gnni_take_input(&m, input);
+        gnni_down(&m);
+        gnni_up(&m);
+        gnni_head(&m, 0, input, j->outputs + (j->first + begin) * area);
+    }
+}
+
+static void gnni_run(gnn_parallel_fn parallel, void *user, uint32_t count, uint32_t grain, gnn_range_fn fn,
+                     void *context)
+{
+    if (parallel && count > grain)
+        parallel(user, count, grain, fn, context);
+    else if (count)
+        fn(context, 0, count);
+}
+
+GNN_API gnn_result gnn_unet_forward(const gnn_unet *n, const float *inputs, uint32_t count, float *outputs,
+                                    void *workspace, size_t size, gnn_parallel_fn parallel, void *parallel_user)
+{
+    gnni_job j;
+    uint32_t parts;
+    memset(&j, 0, sizeof j);
+    j.net = n;
+    j.at = &n->run;
+    j.inputs = inputs;
+    j.outputs = outputs;
+    parts = gnni_parts(j.at, workspace, size, &j.parts);
+    if (!parts)
+        return GNN_BUFFER_TOO_SMALL;
+    for (j.first = 0; j.first < count; j.first += parts)
+        gnni_run(parallel, parallel_user, count - j.first < parts ? count - j.first : parts, 1, gnni_run_range, &j);
+    return GNN_OK;
+}
+
+/* ---- >>train ------------------------------------------------------------------------------------------------ */
+
+/* Gradients of the head's weights, and of its level's map. */
+static void gnni_head_backward(const gnni_map *m, uint32_t level)
+{
+    const gnn_unet_desc *d = &m->net->desc;
+    uint32_t width = d->width >> level, height = d->height >> level, stride = gnn_stride(d->channels[level]), x, y, c;
+    const float *weights = m->net->weights + m->net->heads[level], *dout = m->w + m->at->dout;
+    float *dweights = m->w + m->at->weights + m->net->heads[level];
+    const float *map = m->w + m->at->up_y[level];
+    float *dmap = m->w + m->at->gradients + m->at->up_y[level];
+    for (y = 0; y < height; ++y)
+        for (x = 0; x < width; ++x) {
+            size_t at = gnni_at(width, stride, x, y);
+            float g = dout[(size_t)y * width + x];
+            for (c = 0; c < stride; ++c) {
+                dweights[c * GNNI_HEAD] += g * map[at + c];
+                dmap[at + c] += g * weights[c * GNNI_HEAD];
+            }
+            dweights[stride * GNNI_HEAD] += g;
+        }
+}
+
+static void gnni_halve(float *plane, uint32_t width, uint32_t height)
+{
+    uint32_t x, y;
+    for (y = 0; y < height / 2; ++y)
+        for (x = 0; x < width / 2; ++x) {
+            const float *from = plane + (size_t)2 * y * width + 2 * x;
+            plane[(size_t)y * (width / 2) + x] = 0.25f * ((from[0] + from[1]) + (from[width] + from[width + 1]));
+        }
+}
+
+/* Loss over all levels and its gradients by heads and maps. */
+static double gnni_losses(const gnni_map *m, const float *input, const float *truth)
+{
+    const gnn_unet_desc *d = &m->net->desc;
+    size_t area = (size_t)d->width * d->height;
+    float *plain = m->w + m->at->plain, *small_truth = m->w + m->at->truth, *out = m->w + m->at->out;
+    double sum = 0;
+    uint32_t l;
+    memcpy(plain, input, area * sizeof(float));
+    memcpy(small_truth, truth, area * sizeof(float));
+    for (l = 0; l < gnni_heads(m->net); ++l) {
+        float weight = l == 0 ? 1 : d->deep > 0 ? d->deep : 0;
+        if (weight == 0)
+            break;
+        gnni_head(m, l, plain, out);
+        sum += (double)weight * gnn_loss(out, plain, small_truth, area >> 2 * l, d->lambda, weight, m->w + m->at->dout);
+        gnni_head_backward(m, l);
+        gnni_halve(plain, d->width >> l, d->height >> l);
+        gnni_halve(small_truth, d->width >> l, d->height >> l);
+    }
+    return sum;
+}
+
+/* Gradient maps lie where the maps do; g is where those begin. dup, din: places of them, dadd too; none = 0. */
+static void gnni_layer_backward(const gnni_map *m, const gnni_layer *l, const gnn_conv_maps *maps, size_t out,
+                                float *dup, float *din, float *dadd)
+{
+    gnn_conv_maps all = *maps;
+    all.out = m->w + out;
+    gnn_conv_backward(&l->conv, m->net->weights + l->weights, m->net->prepared + l->prepared, &all,
+                      m->w + m->at->gradients + out, dup, din, dadd, m->w + m->at->weights + l->weights,
+                      m->w + m->at->scratch);
+}
+
+static void gnni_up_backward(const gnni_map *m)
+{
+    const gnn_unet *n = m->net;
+    const gnni_places *at = m->at;
+    float *g = m->w + at->gradients;
+    uint32_t l;
+    for (l = 0; l < gnni_ups(n); ++l) {
+        gnn_conv_maps maps;
+        memset(&maps, 0, sizeof maps);
+        maps.in = maps.add = m->w + at->up_a[l];
+        gnni_layer_backward(m, &n->up[l][1], &maps, at->up_y[l], NULL, g + at->up_a[l], g + at->up_a[l]);
+        maps.up = m->w + at->up_y[l + 1];
+        maps.in = m->w + at->y[l];
+        maps.add = NULL;
+        gnni_layer_backward(m, &n->up[l][0], &maps, at->up_a[l], g + at->up_y[l + 1], g + at->y[l], NULL);
+    }
+}
+
+static void gnni_down_backward(const gnni_map *m)
+{
+    const gnn_unet *n = m->net;
+    const gnni_places *at = m->at;
+    float *g = m->w + at->gradients;
+    uint32_t l;
+    for (l = n->desc.levels; l-- > 0;) {
+        const gnn_conv *c = &n->down[l][0].conv;
+        gnn_conv_maps maps;
+        memset(&maps, 0, sizeof maps);
+        maps.in = maps.add = m->w + at->a[l];
+        maps.scale = n->desc.no_mask ? NULL : m->w + at->scale2[l];
+        gnni_layer_backward(m, &n->down[l][1], &maps, at->y[l], NULL, g + at->a[l], g + at->a[l]);
+        maps.in = m->w + at->x[l];
+        maps.add = NULL;
+        maps.scale = n->desc.no_mask ? NULL : m->w + at->scale1[l];
+        gnni_layer_backward(m, &n->down[l][0], &maps, at->a[l], NULL, l ? g + at->x[l] : NULL, NULL);
+        if (l)
+            gnn_pool_backward(g + at->x[l], 2 * c->width, 2 * c->height, c->in_stride, g + at->y[l - 1]);
+    }
+}
+
+static bool gnni_all_finite(const float *x, size_t count)
+{
+    float sum = 0; /* x - x is 0, or NaN for what is not finite */
+    size_t i;
+    for (i = 0; i < count; ++i)
+        sum += x[i] - x[i];
+    return sum == 0;
+}
+
+static void gnni_train_range(void *context, uint32_t begin, uint32_t end)
+{
+    const gnni_job *j = (const gnni_job *)context;
+    const gnn_unet_desc *d = &j->net->desc;
+    size_t area = (size_t)d->width * d->height;
+    for (; begin < end; ++begin) {
+        const float *input = j->inputs + (size_t)(j->first + begin) * d->inputs * area;
+        gnni_map m;
+        double loss;
+        m.net = j->net;
+        m.at = j->at;
+        m.w = j->parts + begin * j->at->total;
+        memset(m.w + j->at->gradients, 0, (j->at->total - j->at->gradients) * sizeof(float));
+        gnni_take_input(&m, input);
+        gnni_down(&m);
+        gnni_up(&m);
+        loss = gnni_losses(&m, input, j->truths + (j->first + begin) * area);
+        gnni_up_backward(&m);
+        gnni_down_backward(&m);
+        if (!(loss < 1e30) || !gnni_all_finite(m.w + j->at->weights, j->net->floats))
+            loss = -1;                                 /* refused */
+        memcpy(m.w + j->at->head, &loss, sizeof loss); /* for whoever adds up */
+    }
+}
+
+/* Adds the group's gradients in the order of the maps. */
+static void gnni_add_range(void *context, uint32_t begin, uint32_t end)
+{
+    const gnni_job *j = (const gnni_job *)context;
+    uint32_t map, i;
+    for (map = 0; map < j->group; ++map) {
+        const float *part = j->parts + map * j->at->total, *from = part + j->at->weights;
+        double loss;
+        memcpy(&loss, part + j->at->head, sizeof loss);
+        for (i = begin; i < end && loss >= 0; ++i)
+            j->gradients[i] += from[i];
+    }
+}
+
+GNN_API gnn_result gnn_unet_gradients(const gnn_unet *n, const float *inputs, const float *truths, uint32_t count,
+                                      float *gradients, gnn_step *step, void *workspace, size_t size,
+                                      gnn_parallel_fn parallel, void *parallel_user)
+{
+    gnni_job j;
+    uint32_t parts, i;
+    memset(&j, 0, sizeof j);
+    memset(step, 0, sizeof *step);
+    memset(gradients, 0, n->floats * sizeof(float));
+    j.net = n;
+    j.at = &n->train;
+    j.inputs = inputs;
+    j.truths = truths;
+    j.gradients = gradients;
+    parts = gnni_parts(j.at, workspace, size, &j.parts);
+    if (!parts)
+        return GNN_BUFFER_TOO_SMALL;
+    for (j.first = 0; j.first < count; j.first += parts) {
+        j.group = count - j.first < parts ? count - j.first : parts;
+        gnni_run(parallel, parallel_user, j.group, 1, gnni_train_range, &j);
+        gnni_run(parallel, parallel_user, (uint32_t)n->floats, 4096, gnni_add_range, &j);
+        for (i = 0; i < j.group; ++i) {
+            double loss;
+            memcpy(&loss, j.parts + i * j.at->total + j.at->head, sizeof loss);
+            step->maps += loss >= 0;
+            step->loss += loss >= 0 ? loss : 0;
+        }
+    }
+    step->refused = count - step->maps;
+    if (!step->maps)
+        return GNN_OK;
+    step->loss /= step->maps;
+    for (i = 0; i < n->floats; ++i)
+        gradients[i] /= (float)step->maps;
+    return GNN_OK;
+}
+
+GNN_API gnn_result gnn_unet_train(gnn_unet *n, const float *inputs, const float *truths, uint32_t count, gnn_step *step,
+                                  void *workspace, size_t size, gnn_parallel_fn parallel, void *parallel_user)
+{
+    gnn_result result;
+    GNN_ASSERT(n->desc.training);
+    result = gnn_unet_gradients(n, inputs, truths, count, n->gradients, step, workspace, size, parallel, parallel_user);
+    if (result || !step->maps)
+        return result;
+    gnn_adam(n->weights, n->gradients, n->first, n->second, n->floats, ++n->step, n->desc.rate, n->desc.beta1,
+             n->desc.beta2, 1e-8f);
+    gnni_prepare(n);
+    return GNN_OK;
+}
+
+/* ---- >>saves ------------------------------------------------------------------------------------------------ */
+
+/* Tensors of a save: the weights, and to go on training both moments and the number of steps. */
+static const char *const gnni_kinds[] = {"", "adam1.", "adam2."};
+
+/* Values of one tensor of the file as the network needs it. */
+static gnn_result gnni_load_tensor(const gnn_unet *n, float *floats, uint32_t index, const char *kind,
+                                   const gnn_tensor *tensors, uint32_t count, float *values, gnn_message *message)
+{
+    char full[64];
+    uint32_t rank;
+    uint64_t shape[GNN_MAX_RANK], wanted;
+    const gnn_tensor *t;
+    memcpy(full, kind, strlen(kind));
+    wanted = gnn_unet_tensor(n, index, full + strlen(kind), &rank, shape);
+    t = gnn_tensors_find(tensors, count, full);
+    if (!t) {
+        gnn_tensor missing;
+        memset(&missing, 0, sizeof missing);
+        missing.name = full;
+        missing.name_length = (uint32_t)strlen(full);
+        return gnni_fail(message, GNN_MISSING_TENSOR, "it is not in the file", &missing);
+    }
+    if (t->rank != rank || memcmp(t->shape, shape, rank * sizeof *shape) != 0)
+        return gnni_fail(message, GNN_WRONG_TENSOR, "its shape does not fit the network", t);
+    if (!gnn_tensor_floats(t, 0, wanted, values))
+        return gnni_fail(message, GNN_WRONG_TENSOR, "its dtype is neither F32 nor F16", t);
+    if (!gnni_all_finite(values, (size_t)wanted))
+        return gnni_fail(message, GNN_WRONG_TENSOR, "it has values that are not finite", t);
+    gnni_import(n, floats, index, values);
+    return GNN_OK;
+}
+
+/* All tensors of the file into fresh[kinds][floats]; *step where there is one. */
+static gnn_result gnni_load_all(const gnn_unet *n, const gnn_tensor *tensors, uint32_t count, float *fresh,
+                                float *values, uint64_t *step, gnn_message *message)
+{
+    const gnn_tensor *t = n->desc.training ? gnn_tensors_find(tensors, count, "adam.step") : NULL;
+    uint32_t kinds = t ? 3 : 1, kind, i;
+    float halves[2];
+    for (kind = 0; kind < kinds; ++kind)
+        for (i = 0; i < gnn_unet_tensors(n); ++i) {
+            gnn_result result =
+                gnni_load_tensor(n, fresh + kind * n->floats, i, gnni_kinds[kind], tensors, count, values, message);
+            if (result)
+                return result;
+        }
+    *step = 0;
+    if (!t)
+        return GNN_OK;
+    if (!gnn_tensor_floats(t, 0, 2, halves) || !(halves[0] >= 0 && halves[0] < 16777216.0f) ||
+        !(halves[1] >= 0 && halves[1] < 16777216.0f))
+        return gnni_fail(message, GNN_WRONG_TENSOR, "it must be two counts", t);
+    *step = (uint64_t)halves[0] + ((uint64_t)halves[1] << 24);
+    for (i = 0; i < n->floats; ++i)
+        if (fresh[2 * n->floats + i] < 0)
+            return gnni_fail(message, GNN_WRONG_TENSOR, "a tensor adam2. has negative values", NULL);
+    return GNN_OK;
+}
+
+GNN_API gnn_result gnn_unet_load(gnn_unet *n, const void *file, size_t size, gnn_message *message)
+{
+    const gnn_unet_desc *d = &n->desc;
+    uint32_t count;
+    uint64_t step;
+    gnn_tensor *tensors;
+    float *fresh;
+    gnn_result result = gnn_tensors_read(file, size, NULL, 0, &count, message);
+    if (result && result != GNN_BUFFER_TOO_SMALL)
+        return result;
+    tensors = (gnn_tensor *)d->allocate(d->user, (count ? count : 1) * sizeof *tensors);
+    fresh = (float *)d->allocate(d->user, 4 * n->floats * sizeof *fresh);
+    if (!tensors || !fresh) {
+        result = gnni_fail(message, GNN_OUT_OF_MEMORY, gnn_result_string(GNN_OUT_OF_MEMORY), NULL);
+    } else {
+        memset(fresh, 0, 3 * n->floats * sizeof *fresh);
+        result = gnn_tensors_read(file, size, tensors, count, &count, message);
+        if (!result)
+            result = gnni_load_all(n, tensors, count, fresh, fresh + 3 * n->floats, &step, message);
+        if (!result) {
+            memcpy(n->weights, fresh, n->floats * sizeof(float));
+            if (d->training) {
+                memcpy(n->first, fresh + n->floats, 2 * n->floats * sizeof(float));
+                n->step = step;
+            }
+            gnni_prepare(n);
+        }
+    }
+    d->release(d->user, tensors);
+    d->release(d->user, fresh);
+    return result;
+}
+
+/* The list of what is saved, and values for it in `values`; names point into it too. */
+typedef struct gnni_save {
+    gnn_weight *weights;
+    uint32_t count;
+    float *values;
+    char (*names)[64];
+    void *memory;
+} gnni_save;
+
+static bool gnni_save_plan(const gnn_unet *n, gnn_type type, gnni_save *s)
+{
+    uint32_t kinds = n->desc.training && type == GNN_TYPE_F32 ? 3 : 1, count = gnn_unet_tensors(n), kind, i;
+    size_t list = (kinds * count + 1) * sizeof(gnn_weight), names = kinds * count * sizeof *s->names;
+    float *values;
+    s->memory = n->desc.allocate(n->desc.user, list + names + (kinds * n->floats + 2) * sizeof(float));
+    if (!s->memory)
+        return false;
+    s->weights = (gnn_weight *)s->memory;
+    s->names = (char(*)[64])(void *)((char *)s->memory + list);
+    s->values = values = (float *)(void *)((char *)s->memory + list + names);
+    s->count = 0;
+    memset(s->weights, 0, list);
+    for (kind = 0; kind < kinds; ++kind)
+        for (i = 0; i < count; ++i, ++s->count) {
+            gnn_weight *w = &s->weights[s->count];
+            char *name = s->names[s->count];
+            const float *from = kind == 0 ? n->weights : kind == 1 ? n->first : n->second;
+            memcpy(name, gnni_kinds[kind], strlen(gnni_kinds[kind]));
+            w->name = name;
+            w->type = type;
+            w->values = values;
+            gnn_unet_tensor_export(n, from, i, values);
+            values += gnn_unet_tensor(n, i, name + strlen(gnni_kinds[kind]), &w->rank, w->shape);
+        }
+    if (kinds == 3) {
+        gnn_weight *w = &s->weights[s->count++];
+        w->name = "adam.step";
+        w->type = type;
+        w->rank = 1;
+        w->shape[0] = 2;
+        w->values = values;
+        values[0] = (float)(n->step & 0xffffffu);
+        values[1] = (float)(n->step >> 24);
+    }
+    return true;
+}
+
+GNN_API size_t gnn_unet_bound(const gnn_unet *n, gnn_type type, const char *const *metadata)
+{
+    gnni_save s;
+    size_t bound;
+    if (!gnni_save_plan(n, type, &s))
+        return 0;
+    bound = gnn_tensors_bound(s.weights, s.count, metadata);
+    n->desc.release(n->desc.user, s.memory);
+    return bound;
+}
+
+GNN_API gnn_result gnn_unet_save(const gnn_unet *n, gnn_type type, const char *const *metadata, void *buffer,
+                                 size_t size, size_t *written)
+{
+    gnni_save s;
+    gnn_result result;
+    *written = 0;
+    if (!gnni_save_plan(n, type, &s))
+        return GNN_OUT_OF_MEMORY;
+    result = gnn_tensors_write(s.weights, s.count, metadata, buffer, size, written);
+    n->desc.release(n->desc.user, s.memory);
+    return result;
 }
 
 #endif /* GNN_IMPLEMENTATION */
