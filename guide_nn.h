@@ -1,29 +1,99 @@
-/* guide_nn.h 0.1: small neural networks for path guiding: convolutions over (z, phi), safetensors. Licence: MIT or
-   Unlicense.
+/* guide_nn.h 0.1: small neural networks for path guiding: convolutions over directions, a U-Net that repairs
+   histograms, safetensors. Licence: MIT or Unlicense.
 
    In exactly one file, before including it:        #define GNN_IMPLEMENTATION
    Everywhere else only:                            #include "guide_nn.h"
+
+   A few hundred photons binned by direction are a poor distribution to sample from: most bins are empty. This header
+   has the network that repairs such maps while rendering, the layers it is made of, and its training. C99 or C++11, C
+   standard library only (link with -lm).
 
        #define GNN_IMPLEMENTATION
        #include "guide_nn.h"
        int main(void)
        {
-           static float map[34 * 18 * 8], out[34 * 18 * 8], weights[9 * 8 * 8 + 8], prepared[2 * 9 * 8 * 8];
-           gnn_conv conv = {32, 16, 0, 0, 8, 8, 8, 8, true, GNN_SIMD_AUTO}; // 8 channels to 8 over 32 x 16 directions
-           gnn_conv_maps maps = {NULL, map, NULL, NULL, out};
-           conv.simd = gnn_resolve_simd(GNN_SIMD_AUTO);
-           gnn_conv_prepare(&conv, weights, prepared);
-           gnn_conv_forward(&conv, weights, prepared, &maps, NULL);
-           return gnn_conv_check(&conv);
+           enum { maps = 4, area = 16 * 8 };
+           static gnn_unet_desc desc; // zero: all defaults
+           static float inputs[maps][5][area], truths[maps][area], outputs[maps][area];
+           gnn_unet *net; gnn_step step; void *workspace; size_t size;
+           desc.width = 16; desc.height = 8; desc.training = true; desc.rate = 0.01f;
+           if (gnn_unet_create(&desc, &net))
+               return 1;
+           size = gnn_unet_workspace(net, maps, true);
+           workspace = malloc(size);
+           for (int i = 0; workspace && i < 400; ++i) {
+               for (int k = 0; k < maps * area; ++k) { // "photons" of an even light: one bin in four has any
+                   float photons = rand() % 4 ? 0.0f : 4.0f, *bin = &inputs[k / area][0][k % area];
+                   bin[0] = bin[area] = bin[2 * area] = bin[3 * area] = photons;
+                   bin[4 * area] = photons > 0; // the mask
+                   truths[k / area][k % area] = 1;
+               }
+               gnn_unet_train(net, &inputs[0][0][0], &truths[0][0], maps, &step, workspace, size, NULL, NULL);
+           }
+           gnn_unet_forward(net, &inputs[0][0][0], maps, &outputs[0][0], workspace, size, NULL, NULL);
+           return free(workspace), gnn_unet_destroy(net), step.loss > 1; // 1.5 without training
        }
 
    CONTENTS (search for the tag)
-     >>config  macros   >>types  results   >>tensors  safetensors files   >>layers  maps, convolution
+     >>config   macros                         >>layers  maps, convolution, pooling, masks, loss, Adam
+     >>types    results, levels of SIMD        >>unet    create, run, train, load, save
+     >>tensors  safetensors files, half floats
      implementation:
-     >>levels  >>tiles  >>maps  >>convolution  >>backward  >>json  >>files  >>halves  >>writing  >>licence
+     >>levels  >>tiles  >>maps  >>convolution  >>backward  >>json  >>files  >>halves  >>writing
+     >>parts  >>net  >>named  >>run  >>train  >>saves  >>licence
+
+   HOW IT WORKS
+     Maps hold features per direction, (z, phi), equal-area, channels side by side. phi wraps; beyond z = +-1 a map goes
+     on at phi + pi. Each map has a halo of one pixel that says so: convolutions do not know of borders, and a light at
+     a pole or at phi = 0 is repaired like any other.
+     Convolutions are 3x3. All dense work, forward and backward, is done by one kind of kernel: a tile of rows (pixels)
+     and columns (channels) is kept in registers over all that is summed.
+     Upsampling and concatenation are part of the convolution that follows: it reads the small map through 2x2 kernels,
+     one for each parity of a pixel's coordinates, sums of the weights that fall on the same small pixel. That saves 5
+     of 9 multiplications too.
+     Masked (partial) convolutions [Liu 2018] count only valid pixels, scale what they see by 9 / their number, and make
+     valid what sees one. Histograms have no photon in most bins: those are unknown, not dark.
+     The network [Zhu 2021, section 6] is a U-Net with residual links: see gnn_unet_desc. Its output is its input 0 plus
+     what it learned. Inputs and truth should be normalised to mean 1, counts and masks included as the training had
+     them; output can be negative: clamp it.
+     Loss: asymmetric L1, see gnn_loss: of two answers equally far from the truth the one on the side of the input is
+     better, so that noise may stay but details are not blurred away. Levels between are judged too (deep supervision).
+     The paper does not tell the network's sizes, lambda or the weights of levels: the defaults here are our own.
+
+   OPTIONS: see gnn_unet_desc. gnn_unet_resolve fills in defaults, gnn_unet_get_desc returns what a network uses.
+
+   MEMORY
+     A network holds its weights, and about 2.5 times that prepared for kernels; with desc.training three times more.
+     Running and training allocate nothing: the caller gives a workspace of gnn_unet_workspace bytes. gnn_unet_load,
+     gnn_unet_bound and gnn_unet_save allocate for the time of the call. Stack: below 4 KB per call.
 
    THREADS: each function has a tag.
-     [any thread]   pure function on constant data and what the caller hands it */
+     [any thread]   pure function on constant data and on what the caller hands it for this call alone
+     [exclusive]    nothing else on this network at the same time
+     No threads are started. Functions that take a gnn_parallel_fn cut work by maps and let the callback run it (NULL =
+     serially). Results, training too, are bit-identical for any number of threads and any size of workspace.
+
+   ERRORS
+     gnn_result, 0 = ok; gnn_result_string says which field to change; gnn_message names the tensor that did not fit.
+     Asserts (GNN_ASSERT) catch programming errors. A map with NaN, infinity or values far out of range spoils its own
+     output only, and is left out of training (gnn_step.refused).
+     gnn_tensors_read and gnn_unet_load are safe for untrusted input.
+
+   NUMERICAL LIMITS
+     Levels of SIMD differ from scalar by rounding: <= 1e-5 of a convolution's output rms, <= 1e-4 of a network's; so
+     trained weights differ between levels. Within a level all is bit-identical.
+
+   REFERENCES
+     S. Zhu, Z. Xu, T. Sun, A. Kuznetsov, M. Meyer, H. Jensen, H. Su, R. Ramamoorthi 2021, Photon-Driven Neural
+       Reconstruction for Path Guiding.
+     G. Liu, F. Reda, K. Shih, T.-C. Wang, A. Tao, B. Catanzaro 2018, Image Inpainting for Irregular Holes Using Partial
+       Convolutions.
+     O. Ronneberger, P. Fischer, T. Brox 2015, U-Net: Convolutional Networks for Biomedical Image Segmentation.
+     T. Vogels, F. Rousselle, B. McWilliams, G. Roethlin, A. Harvill, D. Adler, M. Meyer, J. Novak 2018, Denoising with
+       Kernel Prediction and Asymmetric Loss Functions.
+     K. He, X. Zhang, S. Ren, J. Sun 2015, Delving Deep into Rectifiers (initial weights).
+     D. Kingma, J. Ba 2015, Adam.
+     K. Goto, R. van de Geijn 2008, Anatomy of High-Performance Matrix Multiplication (register tiles). */
 #ifndef GUIDE_NN_H
 #define GUIDE_NN_H
 
@@ -273,7 +343,7 @@ GNN_API gnn_result gnn_unet_forward(const gnn_unet *net, const float *inputs, ui
 typedef struct gnn_step {
     double loss;      /* mean over the maps that counted, of the sum over levels; 0 where none did */
     uint32_t maps;    /* that counted */
-    uint32_t refused; /* maps whose loss or gradient is not finite: they do not count; best 0 */
+    uint32_t refused; /* maps whose loss is above 1e6 or whose gradient is not finite: they do not count; best 0 */
 } gnn_step;
 
 /* [any thread] Mean gradient over maps by all weights, in the network's order (gnn_unet_floats of them, see
@@ -1776,6 +1846,7 @@ GNN_API double gnn_loss(const float *out, const float *input, const float *truth
 
 #define GNNI_ALIGN(n) (((n) + 15) & ~(size_t)15) /* floats of a cache line */
 #define GNNI_HEAD 8                              /* columns that a head's one output is computed in */
+#define GNNI_MAX_LOSS 1e6                        /* of a map; beyond, a photon of 1e30 W or the like is in it */
 
 static void *gnni_default_allocate(void *user, size_t size)
 {
@@ -2496,7 +2567,7 @@ static void gnni_train_range(void *context, uint32_t begin, uint32_t end)
         loss = gnni_losses(&m, input, j->truths + (j->first + begin) * area);
         gnni_up_backward(&m);
         gnni_down_backward(&m);
-        if (!(loss < 1e30) || !gnni_all_finite(m.w + j->at->weights, j->net->floats))
+        if (!(loss < GNNI_MAX_LOSS) || !gnni_all_finite(m.w + j->at->weights, j->net->floats))
             loss = -1;                                 /* refused */
         memcpy(m.w + j->at->head, &loss, sizeof loss); /* for whoever adds up */
     }

@@ -153,7 +153,7 @@ static inline double naive_level_loss(const naive_net *n, int level, const doubl
 static inline double naive_unet(const naive_net *n, const double *inputs, const double *truth, double *out)
 {
     int area = n->width * n->height;
-    double *down[8], *below, sum = 0, *mask = naive_new((size_t)area), *spare = naive_new((size_t)area);
+    double *down[8] = {0}, *below, sum = 0, *mask = naive_new((size_t)area), *spare = naive_new((size_t)area);
     double *plain[8], *small[8];
     for (int i = 0; i < area; ++i)
         mask[i] = inputs[(n->inputs - 1) * area + i] > 0;

@@ -351,11 +351,216 @@ static void convolution_gradients_are_slopes_on_every_level(void **state)
         }
 }
 
+/* ---- the small parts */
+
+static void halo_wraps_and_crosses_poles(void **state)
+{
+    static const int sizes[][2] = {{2, 1}, {6, 3}, {8, 1}, {10, 7}};
+    (void)state;
+    for (size_t s = 0; s < sizeof sizes / sizeof *sizes; ++s) {
+        int w = sizes[s][0], h = sizes[s][1];
+        double *plane = naive_new((size_t)(w * h));
+        for (int i = 0; i < w * h; ++i)
+            plane[i] = i + 1;
+        float *map = new_floats(gnn_map_floats((uint32_t)w, (uint32_t)h, 8));
+        to_map(plane, w, h, 1, 8, map);
+        for (int y = -1; y <= h; ++y)
+            for (int x = -1; x <= w; ++x) {
+                const float *pixel = map + ((y + 1) * (w + 2) + x + 1) * 8;
+                assert_true((double)pixel[0] == naive_at(plane, w, h, x, y));
+                for (int c = 1; c < 8; ++c)
+                    assert_true(pixel[c] == 0);
+            }
+        free(map), free(plane);
+    }
+}
+
+static void pooling_is_the_mean_and_its_adjoint(void **state)
+{
+    enum { W = 12, H = 6, C = 3 };
+    double *planes = naive_new(W * H * C), *small = naive_new(W * H * C / 4);
+    float *map = new_floats(gnn_map_floats(W, H, 8)), *to = new_floats(gnn_map_floats(W / 2, H / 2, 8));
+    float *back = new_floats(gnn_map_floats(W, H, 8));
+    double left = 0, right = 0;
+    (void)state;
+    seed(4);
+    draw(planes, W * H * C, 1);
+    for (int c = 0; c < C; ++c)
+        for (int y = 0; y < H; ++y)
+            for (int x = 0; x < W; ++x)
+                small[(c * (H / 2) + y / 2) * (W / 2) + x / 2] += planes[(c * H + y) * W + x] / 4;
+    to_map(planes, W, H, C, 8, map);
+    gnn_pool(map, W, H, 8, to);
+    BELOW(map_error(to, 8, small, W / 2, H / 2, C), 1e-6);
+    /* <g, pool(x)> = <back(g), x>, here with g = pool(x) */
+    gnn_pool_backward(to, W, H, 8, back);
+    for (int i = 0; i < W * H * C / 4; ++i)
+        left += small[i] * small[i];
+    for (int c = 0; c < C; ++c)
+        for (int y = 0; y < H; ++y)
+            for (int x = 0; x < W; ++x)
+                right += planes[(c * H + y) * W + x] * (double)back[((y + 1) * (W + 2) + x + 1) * 8 + c];
+    BELOW(fabs(left - right), 1e-6 * left);
+    free(planes), free(small), free(map), free(to), free(back);
+}
+
+static void masks_grow_over_the_seam_and_the_poles(void **state)
+{
+    static const int sizes[][2] = {{2, 1}, {6, 3}, {8, 1}, {10, 7}};
+    (void)state;
+    seed(9);
+    for (size_t s = 0; s < sizeof sizes / sizeof *sizes; ++s)
+        for (int full = 0; full <= 4; ++full) { /* from empty to full */
+            int w = sizes[s][0], h = sizes[s][1];
+            double *plane = naive_new((size_t)(w * h));
+            float *mask = new_floats((size_t)(w * h)), *scale = new_floats((size_t)(w * h));
+            float *grown = new_floats((size_t)(w * h));
+            for (int i = 0; i < w * h; ++i)
+                mask[i] = (float)(plane[i] = rnd() < 0.25 * full);
+            gnn_mask_grow(mask, (uint32_t)w, (uint32_t)h, scale, grown);
+            for (int i = 0; i < w * h; ++i) {
+                double count = 0;
+                for (int k = 0; k < 9; ++k)
+                    count += naive_at(plane, w, h, i % w + k % 3 - 1, i / w + k / 3 - 1);
+                assert_true(grown[i] == (count > 0));
+                assert_true(count > 0 ? fabs((double)scale[i] * count - 9) < 1e-5 : scale[i] == 0);
+                assert_true(full < 4 || scale[i] == 1);
+            }
+            free(plane), free(mask), free(scale), free(grown);
+        }
+}
+
+static void an_empty_mask_gives_zeros_and_no_gradient(void **state)
+{
+    (void)state;
+    seed(12);
+    layer l = make_layer(8, 4, 0, 5, 9, true, true, false);
+    gnn_conv *c = &l.conv;
+    size_t map = gnn_map_floats(c->width, c->height, c->out_stride);
+    float *dout = new_floats(map), *din = new_floats(gnn_map_floats(c->width, c->height, c->in_stride));
+    float *dweights = new_floats(gnn_conv_weights(c));
+    gnn_conv_maps m = maps_of(&l);
+    memset(l.scale, 0, area(&l) * sizeof(float));
+    forward(&l);
+    for (size_t i = 0; i < map; ++i)
+        assert_true(l.out_map[i] == 0);
+    for (size_t i = 0; i < map; ++i)
+        dout[i] = 1;
+    gnn_conv_backward(c, l.weights, l.prepared, &m, dout, NULL, din, NULL, dweights, l.scratch);
+    for (size_t i = 0; i < gnn_conv_weights(c); ++i)
+        assert_true(dweights[i] == 0);
+    for (size_t i = 0; i < gnn_map_floats(c->width, c->height, c->in_stride); ++i)
+        assert_true(din[i] == 0);
+    free(dout), free(din), free(dweights);
+    free_layer(&l);
+}
+
+static void losses_prefer_the_side_of_the_input_and_their_gradients_are_slopes(void **state)
+{
+    static const float truth[] = {1, 1, 1, 1, 2}, input[] = {3, 3, 0, 0, 2}, out[] = {2, 0, 2, 0, 2.5f};
+    float dout[5];
+    (void)state;
+    assert_true(gnn_loss(out, input, truth, 5, 3, 1, NULL) == (double)(1 + 3 + 3 + 1 + 0.5f) / 5);
+    assert_true(gnn_loss(out, input, truth, 5, 3, 2, dout) == (double)(1 + 3 + 3 + 1 + 0.5f) / 5);
+    for (int i = 0; i < 5; ++i) {
+        float moved[5];
+        memcpy(moved, out, sizeof moved);
+        moved[i] += 0.125f;
+        double slope = 2 * (gnn_loss(moved, input, truth, 5, 3, 1, NULL) - gnn_loss(out, input, truth, 5, 3, 1, NULL));
+        BELOW(fabs(slope / 0.125 - (double)dout[i]), 1e-6);
+    }
+}
+
+/* Adam in double precision, as its algorithm 1 has it. */
+static void adam_is_its_algorithm(void **state)
+{
+    float w[3] = {1, -2, 0.5f}, first[3] = {0}, second[3] = {0}, g[3];
+    double x[3] = {1, -2, 0.5}, m[3] = {0}, v[3] = {0};
+    (void)state;
+    seed(3);
+    for (int step = 1; step <= 200; ++step) {
+        for (int i = 0; i < 3; ++i) {
+            g[i] = i == 2 ? 0 : 4 * rndf() - 1;
+            m[i] = 0.9 * m[i] + 0.1 * (double)g[i];
+            v[i] = 0.99 * v[i] + 0.01 * (double)g[i] * (double)g[i];
+            x[i] -= 0.01 * (m[i] / (1 - pow(0.9, step))) / (sqrt(v[i] / (1 - pow(0.99, step))) + 1e-8);
+        }
+        gnn_adam(w, g, first, second, 3, (uint64_t)step, 0.01f, 0.9f, 0.99f, 1e-8f);
+    }
+    for (int i = 0; i < 3; ++i)
+        BELOW(fabs((double)w[i] - x[i]), 1e-4);
+    assert_true(w[2] == 0.5f);
+}
+
+/* NaN reaches what looks at it, and nothing else: no sum over pixels or channels hides in a kernel. */
+static void not_a_number_reaches_its_neighbours_only(void **state)
+{
+    gnn_simd list[4];
+    int n = levels(list);
+    (void)state;
+    for (int k = 0; k < n; ++k) {
+        seed(6);
+        layer l = make_layer(40, 20, 0, 16, 16, false, false, false);
+        l.conv.simd = list[k];
+        size_t total = gnn_map_floats(40, 20, 16);
+        float *before = new_floats(total);
+        forward(&l);
+        memcpy(before, l.out_map, total * sizeof(float));
+        l.in_map[(11 * 42 + 21) * 16 + 3] = NAN; /* x = 20, y = 10 */
+        forward(&l);
+        for (int y = 0; y < 20; ++y)
+            for (int x = 0; x < 40; ++x)
+                for (int c = 0; c < 16; ++c) {
+                    size_t at = (size_t)(((y + 1) * 42 + x + 1) * 16 + c);
+                    bool near = abs(x - 20) <= 1 && abs(y - 10) <= 1;
+                    if (abs(x - 20) <= 1 && abs(y - 10) <= 1)
+                        assert_true(l.out_map[at] != l.out_map[at]);
+                    else
+                        assert_true(near || memcmp(&l.out_map[at], &before[at], sizeof(float)) == 0);
+                }
+        free(before);
+        free_layer(&l);
+    }
+}
+
+static void shapes_that_do_not_fit_are_refused(void **state)
+{
+    gnn_conv good = {8, 4, 3, 8, 2, 8, 5, 8, true, GNN_SIMD_SCALAR}, c;
+    (void)state;
+    assert_int_equal(gnn_conv_check(&good), GNN_OK);
+#define REFUSED(result, change)                                                                                        \
+    c = good;                                                                                                          \
+    change;                                                                                                            \
+    assert_int_equal(gnn_conv_check(&c), result)
+    REFUSED(GNN_BAD_SHAPE, c.width = 6);
+    REFUSED(GNN_BAD_SHAPE, c.width = 0);
+    REFUSED(GNN_BAD_SHAPE, c.height = 3);
+    REFUSED(GNN_BAD_SHAPE, c.height = 0);
+    REFUSED(GNN_BAD_SHAPE, c.width = 8192);
+    REFUSED(GNN_BAD_RANGE, c.up_stride = 3);
+    REFUSED(GNN_BAD_RANGE, c.in_stride = 1);
+    REFUSED(GNN_BAD_RANGE, c.out_stride = 5);
+    REFUSED(GNN_BAD_RANGE, c.out = c.out_stride = 0);
+    REFUSED(GNN_BAD_RANGE, c.up = c.in = 0);
+    REFUSED(GNN_BAD_RANGE, c.in = c.in_stride = 100000);
+    assert_int_equal(gnn_resolve_simd((gnn_simd)77), GNN_SIMD_AUTO);
+    assert_string_equal(gnn_result_string(GNN_OK), "ok");
+    assert_non_null(gnn_result_string((gnn_result)99));
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(convolution_is_its_definition_on_every_level),
         cmocka_unit_test(convolution_gradients_are_slopes_on_every_level),
+        cmocka_unit_test(halo_wraps_and_crosses_poles),
+        cmocka_unit_test(pooling_is_the_mean_and_its_adjoint),
+        cmocka_unit_test(masks_grow_over_the_seam_and_the_poles),
+        cmocka_unit_test(an_empty_mask_gives_zeros_and_no_gradient),
+        cmocka_unit_test(losses_prefer_the_side_of_the_input_and_their_gradients_are_slopes),
+        cmocka_unit_test(adam_is_its_algorithm),
+        cmocka_unit_test(not_a_number_reaches_its_neighbours_only),
+        cmocka_unit_test(shapes_that_do_not_fit_are_refused),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
