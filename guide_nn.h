@@ -39,7 +39,7 @@
      >>types    results, levels of SIMD        >>unet    create, run, train, load, save
      >>tensors  safetensors files, half floats
      implementation:
-     >>levels  >>tiles  >>maps  >>convolution  >>backward  >>json  >>files  >>halves  >>writing
+     >>levels  >>tiles  >>maps  >>convolution  >>winograd  >>prepare  >>backward  >>json  >>files  >>halves  >>writing
      >>parts  >>net  >>named  >>run  >>train  >>saves  >>licence
 
    HOW IT WORKS
@@ -51,6 +51,8 @@
      Upsampling and concatenation are part of the convolution that follows: it reads the small map through 2x2 kernels,
      one for each parity of a pixel's coordinates, sums of the weights that fall on the same small pixel. That saves 5
      of 9 multiplications too.
+     Large maps are convolved by Winograd's method [Lavin 2016], a quarter of the multiplications; so is the
+     upsampled concatenation then.
      Masked (partial) convolutions [Liu 2018] count only valid pixels, scale what they see by 9 / their number, and make
      valid what sees one. Histograms have no photon in most bins: those are unknown, not dark.
      The network [Zhu 2021, section 6] is a U-Net with residual links: see gnn_unet_desc. Its output is its input 0 plus
@@ -63,7 +65,7 @@
    OPTIONS: see gnn_unet_desc. gnn_unet_resolve fills in defaults, gnn_unet_get_desc returns what a network uses.
 
    MEMORY
-     A network holds its weights, and about 2.5 times that prepared for kernels; with desc.training three times more.
+     A network holds its weights, and 2 to 6 times that prepared for kernels; with desc.training three times more.
      Running and training allocate nothing: the caller gives a workspace of gnn_unet_workspace bytes. gnn_unet_load,
      gnn_unet_bound and gnn_unet_save allocate for the time of the call. Stack: below 4 KB per call.
 
@@ -80,8 +82,9 @@
      gnn_tensors_read and gnn_unet_load are safe for untrusted input.
 
    NUMERICAL LIMITS
-     Levels of SIMD differ from scalar by rounding: <= 1e-5 of a convolution's output rms, <= 1e-4 of a network's; so
-     trained weights differ between levels. Within a level all is bit-identical.
+     Winograd's method differs from the definition by <= 5e-5 of a convolution's output rms, the direct kernel by <=
+   1e-5; levels of SIMD from each other by as much, a network's output by <= 1e-4; so trained weights differ between
+   levels. Within a level all is bit-identical.
 
    REFERENCES
      S. Zhu, Z. Xu, T. Sun, A. Kuznetsov, M. Meyer, H. Jensen, H. Su, R. Ramamoorthi 2021, Photon-Driven Neural
@@ -93,6 +96,7 @@
        Kernel Prediction and Asymmetric Loss Functions.
      K. He, X. Zhang, S. Ren, J. Sun 2015, Delving Deep into Rectifiers (initial weights).
      D. Kingma, J. Ba 2015, Adam.
+     A. Lavin, S. Gray 2016, Fast Algorithms for Convolutional Neural Networks.
      K. Goto, R. van de Geijn 2008, Anatomy of High-Performance Matrix Multiplication (register tiles). */
 #ifndef GUIDE_NN_H
 #define GUIDE_NN_H
@@ -133,7 +137,7 @@ extern "C" {
 typedef enum gnn_result { GNN_RESULTS(GNN_RESULT_ENUM) GNN_RESULT_COUNT } gnn_result;
 #undef GNN_RESULT_ENUM
 
-/* AUTO: the best that the machine has. Levels differ by rounding: <= 1e-5 of a layer's output rms. */
+/* AUTO: the best that the machine has. Levels differ by rounding, see NUMERICAL LIMITS. */
 typedef enum gnn_simd { GNN_SIMD_AUTO, GNN_SIMD_SCALAR, GNN_SIMD_AVX2, GNN_SIMD_AVX512, GNN_SIMD_NEON } gnn_simd;
 
 typedef void (*gnn_range_fn)(void *context, uint32_t begin, uint32_t end);
@@ -233,7 +237,10 @@ typedef struct gnn_conv {
     uint32_t in, in_stride;   /* channels of the map of full size, 0 = none; its floats a pixel (any number >= in) */
     uint32_t out, out_stride; /* gnn_stride(out) */
     bool relu;
-    gnn_simd simd; /* resolved, see gnn_resolve_simd */
+    gnn_simd simd;    /* resolved, see gnn_resolve_simd */
+    bool no_winograd; /* else maps of at least 32 tiles of 4x4 are convolved by Winograd's method, which needs a quarter
+                         of the multiplications and differs by <= 1e-4 of the output's rms; NaN and infinity reach
+                         pixels of the same tiles then */
 } gnn_conv;
 
 /* The maps of a call, all with halo (add and out: it is not read). dmaps of the backward pass have the same shapes. */
@@ -589,6 +596,7 @@ static inline gnni_eight gnni_eight_max0(gnni_eight a)
 #define GNNI_SCALAR_SET(x) gnni_eight_set(x)
 #define GNNI_SCALAR_FMA(a, b, c) gnni_eight_add(gnni_eight_mul(a, b), c)
 #define GNNI_SCALAR_ADD(a, b) gnni_eight_add(a, b)
+#define GNNI_SCALAR_SUB(a, b) gnni_eight_add(a, gnni_eight_mul(gnni_eight_set(-1), b))
 #define GNNI_SCALAR_MUL(a, b) gnni_eight_mul(a, b)
 #define GNNI_SCALAR_MAX0(x) gnni_eight_max0(x)
 GNNI_TILE(SCALAR, 1, 4)
@@ -604,6 +612,7 @@ GNNI_ROWS(SCALAR, 1, 4, 4)
 #define GNNI_AVX2_SET(x) _mm256_set1_ps(x)
 #define GNNI_AVX2_FMA(a, b, c) _mm256_fmadd_ps(a, b, c)
 #define GNNI_AVX2_ADD(a, b) _mm256_add_ps(a, b)
+#define GNNI_AVX2_SUB(a, b) _mm256_sub_ps(a, b)
 #define GNNI_AVX2_MUL(a, b) _mm256_mul_ps(a, b)
 #define GNNI_AVX2_MAX0(x) _mm256_max_ps(_mm256_setzero_ps(), x)
 GNNI_TILE(AVX2, 1, 8)
@@ -622,6 +631,7 @@ GNNI_ROWS(AVX2, 2, 4, 4)
 #define GNNI_AVX512_SET(x) _mm512_set1_ps(x)
 #define GNNI_AVX512_FMA(a, b, c) _mm512_fmadd_ps(a, b, c)
 #define GNNI_AVX512_ADD(a, b) _mm512_add_ps(a, b)
+#define GNNI_AVX512_SUB(a, b) _mm512_sub_ps(a, b)
 #define GNNI_AVX512_MUL(a, b) _mm512_mul_ps(a, b)
 /* gcc 12 takes what _mm512_max_ps leaves undefined, and nobody reads, for uninitialised. */
 #define GNNI_AVX512_MAX0(x) _mm512_maskz_max_ps(0xffff, _mm512_setzero_ps(), x)
@@ -644,6 +654,7 @@ GNNI_ROWS(AVX512, 2, 8, 4)
 #define GNNI_NEON_SET(x) vdupq_n_f32(x)
 #define GNNI_NEON_FMA(a, b, c) vfmaq_f32(c, a, b)
 #define GNNI_NEON_ADD(a, b) vaddq_f32(a, b)
+#define GNNI_NEON_SUB(a, b) vsubq_f32(a, b)
 #define GNNI_NEON_MUL(a, b) vmulq_f32(a, b)
 #define GNNI_NEON_MAX0(x) vmaxq_f32(x, vdupq_n_f32(0))
 GNNI_TILE(NEON, 2, 8)
@@ -791,13 +802,314 @@ GNN_API void gnn_conv_export(const gnn_conv *c, const float *weights, float *ker
         bias[o] = weights[gnni_up_weights(c) + gnni_in_weights(c) + o];
 }
 
+/* Add the term that reads k contiguous floats a row. */
+static void gnni_term_add(gnni_product *p, const float *a, size_t row_step, const float *b, uint32_t b_step, uint32_t k)
+{
+    gnni_term *t = &p->terms[p->count++];
+    t->a = a;
+    t->b = b;
+    t->row_step = (ptrdiff_t)row_step;
+    t->k_step = 1;
+    t->b_step = (ptrdiff_t)b_step;
+    t->k = k;
+}
+
+/* ---- >>winograd --------------------------------------------------------------------------------------------- */
+
+/* F(4x4, 3x3) of Lavin and Gray 2016: a tile of 4x4 outputs needs 36 products for 144. Tiles of 6x6 inputs are
+   transformed, B^T d B; for each of the 36 places a matrix product over channels adds up; A^T m A gives the outputs.
+   Vectors run along channels. Rounding: about 1e-6 of the outputs' rms, up to 1e-5. */
+#define GNNI_TILES 32u /* worked on at once: 36 * 32 * (channels in and out) floats stay in the second-level cache */
+
+/* Pays where the transformed weights are used by many tiles; fewer find them in slower memory (measured: at 8 tiles the
+   direct kernel is the faster one). */
+static bool gnni_winograd(const gnn_conv *c)
+{
+    return !c->no_winograd && c->width % 4 == 0 && c->height % 4 == 0 &&
+           (c->width / 4) * (c->height / 4) >= GNNI_TILES && (!c->in || c->in_stride % 8 == 0);
+}
+
+static uint32_t gnni_channels(const gnn_conv *c) { return (c->up ? c->up_stride : 0) + (c->in ? c->in_stride : 0); }
+
+/* Floats from one of the 36 places to the next; staggered by a cache line, else all fall on the same sets. */
+static size_t gnni_plane(uint32_t channels) { return (size_t)GNNI_TILES * channels + 16; }
+
+static size_t gnni_winograd_prepared(const gnn_conv *c)
+{
+    return gnni_winograd(c) ? (size_t)36 * gnni_channels(c) * c->out_stride : 0;
+}
+
+static size_t gnni_winograd_scratch(const gnn_conv *c)
+{
+    return gnni_winograd(c) ? 36 * (gnni_plane(gnni_channels(c)) + gnni_plane(c->out_stride)) : 0;
+}
+
+/* u = G g G^T of one 3x3 kernel whose taps lie `step` floats apart; u[36]. In double precision: done once. */
+static void gnni_winograd_weight(const float *g, size_t step, double *u)
+{
+    static const double G[6][3] = {{1.0 / 4, 0, 0},
+                                   {-1.0 / 6, -1.0 / 6, -1.0 / 6},
+                                   {-1.0 / 6, 1.0 / 6, -1.0 / 6},
+                                   {1.0 / 24, 1.0 / 12, 1.0 / 6},
+                                   {1.0 / 24, -1.0 / 12, 1.0 / 6},
+                                   {0, 0, 1}};
+    double half[6][3];
+    uint32_t i, j;
+    for (i = 0; i < 6; ++i)
+        for (j = 0; j < 3; ++j)
+            half[i][j] = G[i][0] * (double)g[j * step] + G[i][1] * (double)g[(3 + j) * step] +
+                         G[i][2] * (double)g[(6 + j) * step];
+    for (i = 0; i < 6; ++i)
+        for (j = 0; j < 6; ++j)
+            u[6 * i + j] = half[i][0] * G[j][0] + half[i][1] * G[j][1] + half[i][2] * G[j][2];
+}
+
+/* u[36][channels][out_stride], each in pieces of columns. */
+static void gnni_winograd_prepare(const gnn_conv *c, const float *weights, float *u)
+{
+    uint32_t channels = gnni_channels(c), up = c->up ? c->up_stride : 0, i, o, column, piece, k;
+    size_t plane = (size_t)channels * c->out_stride;
+    double one[36];
+    for (column = 0; column < c->out_stride; column += piece) {
+        piece = gnni_piece(c->out_stride - column);
+        for (i = 0; i < channels; ++i)
+            for (o = 0; o < piece; ++o) {
+                uint32_t stride = i < up ? c->up_stride : c->in_stride;
+                const float *g = i < up ? weights + (size_t)i * c->out_stride
+                                        : weights + gnni_up_weights(c) + (size_t)(i - up) * c->out_stride;
+                gnni_winograd_weight(g + column + o, (size_t)stride * c->out_stride, one);
+                for (k = 0; k < 36; ++k)
+                    u[k * plane + (size_t)column * channels + (size_t)i * piece + o] = (float)one[k];
+            }
+    }
+}
+
+/* What a tile's outputs become. */
+typedef struct gnni_finish {
+    const float *m, *bias, *scale, *add; /* m[36][plane]; scale, add may be NULL */
+    float *out;
+    size_t plane, scale_row, row, pixel; /* floats from one to the next */
+    bool relu;
+} gnni_finish;
+
+/* t = B^T d. */
+#define GNNI_INPUT_6(L, d, t)                                                                                          \
+    do {                                                                                                               \
+        GNNI_##L##_V four = GNNI_##L##_SET(4), minus4 = GNNI_##L##_SET(-4), minus5 = GNNI_##L##_SET(-5);               \
+        GNNI_##L##_V a = GNNI_##L##_FMA(minus4, d[2], d[4]), b = GNNI_##L##_FMA(minus4, d[1], d[3]);                   \
+        GNNI_##L##_V p = GNNI_##L##_SUB(d[4], d[2]), q = GNNI_##L##_SUB(d[3], d[1]);                                   \
+        q = GNNI_##L##_ADD(q, q);                                                                                      \
+        t[0] = GNNI_##L##_FMA(four, d[0], GNNI_##L##_FMA(minus5, d[2], d[4]));                                         \
+        t[1] = GNNI_##L##_ADD(a, b);                                                                                   \
+        t[2] = GNNI_##L##_SUB(a, b);                                                                                   \
+        t[3] = GNNI_##L##_ADD(p, q);                                                                                   \
+        t[4] = GNNI_##L##_SUB(p, q);                                                                                   \
+        t[5] = GNNI_##L##_FMA(four, d[1], GNNI_##L##_FMA(minus5, d[3], d[5]));                                         \
+    } while (0)
+
+/* o = A^T m. */
+#define GNNI_OUTPUT_4(L, m, o)                                                                                         \
+    do {                                                                                                               \
+        GNNI_##L##_V s = GNNI_##L##_ADD(m[1], m[2]), d = GNNI_##L##_SUB(m[1], m[2]);                                   \
+        GNNI_##L##_V u = GNNI_##L##_ADD(m[3], m[4]), v = GNNI_##L##_SUB(m[3], m[4]);                                   \
+        o[0] = GNNI_##L##_ADD(GNNI_##L##_ADD(m[0], s), u);                                                             \
+        o[1] = GNNI_##L##_FMA(GNNI_##L##_SET(2), v, d);                                                                \
+        o[2] = GNNI_##L##_FMA(GNNI_##L##_SET(4), u, s);                                                                \
+        o[3] = GNNI_##L##_ADD(GNNI_##L##_FMA(GNNI_##L##_SET(8), v, d), m[5]);                                          \
+    } while (0)
+
+/* Channels of one vector of one tile: pixel (i, j) of the 6x6 stands at rows[i] + columns[j]. */
+#define GNNI_WINOGRAD(L)                                                                                               \
+    GNNI_##L##_TARGET static void gnni_winograd_in_##L(const float *const *rows, const size_t *columns, float *v,      \
+                                                       size_t plane)                                                   \
+    {                                                                                                                  \
+        GNNI_##L##_V half[6][6], d[6], t[6];                                                                           \
+        int i, j;                                                                                                      \
+        GNNI_UNROLL for (j = 0; j < 6; ++j)                                                                            \
+        {                                                                                                              \
+            GNNI_UNROLL for (i = 0; i < 6; ++i) d[i] = GNNI_##L##_LOAD(rows[i] + columns[j]);                          \
+            GNNI_INPUT_6(L, d, t);                                                                                     \
+            GNNI_UNROLL for (i = 0; i < 6; ++i) half[i][j] = t[i];                                                     \
+        }                                                                                                              \
+        GNNI_UNROLL for (i = 0; i < 6; ++i)                                                                            \
+        {                                                                                                              \
+            GNNI_INPUT_6(L, half[i], t);                                                                               \
+            GNNI_UNROLL for (j = 0; j < 6; ++j) GNNI_##L##_STORE(v + (size_t)(6 * i + j) * plane, t[j]);               \
+        }                                                                                                              \
+    }                                                                                                                  \
+    GNNI_##L##_TARGET static void gnni_winograd_out_##L(const gnni_finish *f, uint32_t column)                         \
+    {                                                                                                                  \
+        GNNI_##L##_V half[4][6], m[6], o[4], x, bias = GNNI_##L##_LOAD(f->bias + column);                              \
+        int i, j;                                                                                                      \
+        GNNI_UNROLL for (j = 0; j < 6; ++j)                                                                            \
+        {                                                                                                              \
+            GNNI_UNROLL for (i = 0; i < 6; ++i) m[i] =                                                                 \
+                GNNI_##L##_LOAD(f->m + (size_t)(6 * i + j) * f->plane + column);                                       \
+            GNNI_OUTPUT_4(L, m, o);                                                                                    \
+            GNNI_UNROLL for (i = 0; i < 4; ++i) half[i][j] = o[i];                                                     \
+        }                                                                                                              \
+        GNNI_UNROLL for (i = 0; i < 4; ++i)                                                                            \
+        {                                                                                                              \
+            GNNI_OUTPUT_4(L, half[i], o);                                                                              \
+            GNNI_UNROLL for (j = 0; j < 4; ++j)                                                                        \
+            {                                                                                                          \
+                size_t at = (size_t)i * f->row + (size_t)j * f->pixel + column;                                        \
+                float scale = f->scale ? f->scale[(size_t)i * f->scale_row + (size_t)j] : 1;                           \
+                x = o[j];                                                                                              \
+                if (f->scale)                                                                                          \
+                    x = GNNI_##L##_MUL(x, GNNI_##L##_SET(scale));                                                      \
+                if (scale > 0)                                                                                         \
+                    x = GNNI_##L##_ADD(x, bias);                                                                       \
+                if (f->add)                                                                                            \
+                    x = GNNI_##L##_ADD(x, GNNI_##L##_LOAD(f->add + at));                                               \
+                if (f->relu)                                                                                           \
+                    x = GNNI_##L##_MAX0(x);                                                                            \
+                GNNI_##L##_STORE(f->out + at, x);                                                                      \
+            }                                                                                                          \
+        }                                                                                                              \
+    }
+
+GNNI_WINOGRAD(SCALAR)
+#if GNNI_X86
+GNNI_WINOGRAD(AVX2)
+GNNI_WINOGRAD(AVX512)
+#endif
+#if GNNI_NEON
+GNNI_WINOGRAD(NEON)
+#endif
+
+static void gnni_winograd_in(gnn_simd simd, const float *const *rows, const size_t *columns, uint32_t channels,
+                             float *v, size_t plane)
+{
+    const float *r[6];
+    uint32_t c = 0, k, step;
+    for (; c < channels; c += step) {
+        for (k = 0; k < 6; ++k)
+            r[k] = rows[k] + c;
+        step = 8;
+#if GNNI_X86
+        if (simd == GNN_SIMD_AVX512 && c + 16 <= channels) {
+            gnni_winograd_in_AVX512(r, columns, v + c, plane);
+            step = 16;
+        } else if (simd != GNN_SIMD_SCALAR) {
+            gnni_winograd_in_AVX2(r, columns, v + c, plane);
+        } else
+#elif GNNI_NEON
+        if (simd == GNN_SIMD_NEON) {
+            gnni_winograd_in_NEON(r, columns, v + c, plane);
+            step = 4;
+        } else
+#endif
+            gnni_winograd_in_SCALAR(r, columns, v + c, plane);
+    }
+    (void)simd;
+}
+
+static void gnni_winograd_out(gnn_simd simd, const gnni_finish *f, uint32_t columns)
+{
+    uint32_t c = 0, step;
+    for (; c < columns; c += step) {
+        step = 8;
+#if GNNI_X86
+        if (simd == GNN_SIMD_AVX512 && c + 16 <= columns) {
+            gnni_winograd_out_AVX512(f, c);
+            step = 16;
+        } else if (simd != GNN_SIMD_SCALAR) {
+            gnni_winograd_out_AVX2(f, c);
+        } else
+#elif GNNI_NEON
+        if (simd == GNN_SIMD_NEON) {
+            gnni_winograd_out_NEON(f, c);
+            step = 4;
+        } else
+#endif
+            gnni_winograd_out_SCALAR(f, c);
+    }
+    (void)simd;
+}
+
+/* The transformed inputs of tile (x, y); v is the tile's first float in plane 0. */
+static void gnni_winograd_tile_in(const gnn_conv *c, const gnn_conv_maps *m, uint32_t x, uint32_t y, float *v,
+                                  size_t plane)
+{
+    const float *rows[6];
+    size_t columns[6];
+    int64_t k;
+    if (c->up) { /* pixel p of the upsampled map is pixel p >> 1 of the small one; counted from the halo to stay >= 0 */
+        for (k = 0; k < 6; ++k) {
+            rows[k] = m->up + gnni_at(c->width / 2, c->up_stride, -1, (4 * (int64_t)y + k + 1) / 2 - 1);
+            columns[k] = (size_t)((4 * (int64_t)x + k + 1) / 2) * c->up_stride;
+        }
+        gnni_winograd_in(c->simd, rows, columns, c->up_stride, v, plane);
+        v += c->up_stride;
+    }
+    if (c->in) {
+        for (k = 0; k < 6; ++k) {
+            rows[k] = m->in + gnni_at(c->width, c->in_stride, -1, 4 * (int64_t)y + k - 1);
+            columns[k] = (size_t)(4 * (int64_t)x + k) * c->in_stride;
+        }
+        gnni_winograd_in(c->simd, rows, columns, c->in_stride, v, plane);
+    }
+}
+
+static void gnni_winograd_multiply(const gnn_conv *c, const float *u, const float *v, float *m, uint32_t tiles)
+{
+    uint32_t channels = gnni_channels(c), column, k;
+    gnni_product p;
+    memset(&p, 0, sizeof p);
+    p.rows = tiles;
+    p.c_step = (ptrdiff_t)c->out_stride;
+    for (k = 0; k < 36; ++k)
+        for (column = 0; column < c->out_stride; column += p.columns) {
+            p.columns = gnni_piece(c->out_stride - column);
+            p.count = 0;
+            gnni_term_add(&p, v + k * gnni_plane(channels), channels,
+                          u + (size_t)k * channels * c->out_stride + (size_t)column * channels, p.columns, channels);
+            p.c = m + k * gnni_plane(c->out_stride) + column;
+            gnni_multiply(&p, c->simd);
+        }
+}
+
+static void gnni_winograd_forward(const gnn_conv *c, const float *bias, const float *u, const gnn_conv_maps *maps,
+                                  float *scratch)
+{
+    uint32_t across = c->width / 4, count = across * (c->height / 4), first, t, channels = gnni_channels(c);
+    float *v = scratch, *m = scratch + 36 * gnni_plane(channels);
+    gnni_finish f;
+    f.plane = gnni_plane(c->out_stride);
+    f.scale_row = c->width;
+    f.pixel = c->out_stride;
+    f.row = (size_t)(c->width + 2) * c->out_stride;
+    f.relu = c->relu;
+    f.bias = bias;
+    for (first = 0; first < count; first += GNNI_TILES) {
+        uint32_t tiles = count - first < GNNI_TILES ? count - first : GNNI_TILES;
+        for (t = 0; t < tiles; ++t)
+            gnni_winograd_tile_in(c, maps, (first + t) % across, (first + t) / across, v + (size_t)t * channels,
+                                  gnni_plane(channels));
+        gnni_winograd_multiply(c, u, v, m, tiles);
+        for (t = 0; t < tiles; ++t) {
+            uint32_t x = 4 * ((first + t) % across), y = 4 * ((first + t) / across);
+            size_t at = gnni_at(c->width, c->out_stride, x, y);
+            f.m = m + (size_t)t * c->out_stride;
+            f.out = maps->out + at;
+            f.add = maps->add ? maps->add + at : NULL;
+            f.scale = maps->scale ? maps->scale + (size_t)y * c->width + x : NULL;
+            gnni_winograd_out(c->simd, &f, c->out_stride);
+        }
+    }
+}
+
+/* ---- >>prepare ---------------------------------------------------------------------------------------------- */
+
 /* What prepare derives, in this order. Upsampling: pixels of the output of equal parity (y & 1, x & 1) see the small
    map through a 2x2 kernel whose weights are sums of those of the 3x3 kernel: 4 multiplications for 9. */
 typedef struct gnni_prepared {
-    size_t up;      /* [4 parities][2x2][up_stride][out_stride] */
-    size_t in;      /* [9][in_stride][out_stride] in pieces */
-    size_t back_up; /* [9 taps][out_stride][up_stride] in pieces of each tap, taps as in the forward pass */
-    size_t back_in; /* the same with in_stride; only where that is a multiple of 8 */
+    size_t up;       /* [4 parities][2x2][up_stride][out_stride] */
+    size_t in;       /* [9][in_stride][out_stride] in pieces */
+    size_t back_up;  /* [9 taps][out_stride][up_stride] in pieces of each tap, taps as in the forward pass */
+    size_t back_in;  /* the same with in_stride; only where that is a multiple of 8 */
+    size_t winograd; /* [36][channels][out_stride] in pieces; only where it is used */
     size_t total;
 } gnni_prepared;
 
@@ -810,7 +1122,8 @@ static gnni_prepared gnni_layout(const gnn_conv *c)
     p.in = p.up + (c->up ? (size_t)16 * c->up_stride * c->out_stride : 0);
     p.back_up = p.in + gnni_in_weights(c);
     p.back_in = p.back_up + gnni_up_weights(c);
-    p.total = p.back_in + (gnni_has_back(c) ? gnni_in_weights(c) : 0);
+    p.winograd = p.back_in + (gnni_has_back(c) ? gnni_in_weights(c) : 0);
+    p.total = p.winograd + gnni_winograd_prepared(c);
     return p;
 }
 
@@ -865,6 +1178,8 @@ GNN_API void gnn_conv_prepare(const gnn_conv *c, const float *weights, float *pr
     const float *in = weights + gnni_up_weights(c);
     size_t up_tap = (size_t)c->up_stride * c->out_stride, in_tap = (size_t)c->in_stride * c->out_stride;
     uint32_t tap;
+    if (gnni_winograd(c))
+        gnni_winograd_prepare(c, weights, prepared + at.winograd);
     if (c->up) /* back_up is large enough to hold the sums on the way */
         gnni_prepare_up(c, weights, prepared + at.up, prepared + at.back_up);
     if (c->in)
@@ -876,18 +1191,6 @@ GNN_API void gnn_conv_prepare(const gnn_conv *c, const float *weights, float *pr
         if (gnni_has_back(c))
             gnni_pack_transposed(in + tap * in_tap, c->in_stride, c->out_stride, prepared + at.back_in + tap * in_tap);
     }
-}
-
-/* Add the term that reads k contiguous floats a row. */
-static void gnni_term_add(gnni_product *p, const float *a, size_t row_step, const float *b, uint32_t b_step, uint32_t k)
-{
-    gnni_term *t = &p->terms[p->count++];
-    t->a = a;
-    t->b = b;
-    t->row_step = (ptrdiff_t)row_step;
-    t->k_step = 1;
-    t->b_step = (ptrdiff_t)b_step;
-    t->k = k;
 }
 
 /* A row of outputs: all pixels, or with up those of one parity; columns of one piece. */
@@ -930,8 +1233,12 @@ GNN_API void gnn_conv_forward(const gnn_conv *c, const float *weights, const flo
     gnni_product p;
     const float *bias = weights + gnni_up_weights(c) + gnni_in_weights(c);
     uint32_t y, column, x;
-    (void)scratch;
     GNN_ASSERT(gnn_conv_check(c) == GNN_OK);
+    if (gnni_winograd(c)) {
+        gnni_winograd_forward(c, bias, prepared + gnni_layout(c).winograd, m, scratch);
+        gnn_map_halo(m->out, c->width, c->height, c->out_stride);
+        return;
+    }
     memset(&p, 0, sizeof p);
     p.relu = c->relu;
     for (column = 0; column < c->out_stride; column += p.columns)
@@ -950,7 +1257,9 @@ GNN_API size_t gnn_conv_scratch(const gnn_conv *c)
 {
     size_t small = c->up ? (size_t)16 * c->up_stride * c->out_stride : 0;
     size_t large = c->up ? gnn_map_floats(c->width, c->height, c->up_stride) : 0;
-    return small > large ? small : large;
+    size_t winograd = gnni_winograd_scratch(c);
+    large = small > large ? small : large;
+    return winograd > large ? winograd : large;
 }
 
 /* dout becomes the gradient by the sum before scale; what bias and add get from it on the way. */
@@ -1962,8 +2271,7 @@ static void gnni_plan_layers(gnn_unet *n)
     uint32_t l;
     for (l = 0; l < d->levels; ++l) {
         uint32_t in = l ? d->channels[l - 1] : d->inputs;
-        gnni_layer_plan(n, &n->down[l][0], l, 0, in, l ? gnn_stride(in) : in); /* the input is not padded: nobody asks
-                                                                                 for its gradient */
+        gnni_layer_plan(n, &n->down[l][0], l, 0, in, gnn_stride(in));
         gnni_layer_plan(n, &n->down[l][1], l, 0, d->channels[l], gnn_stride(d->channels[l]));
     }
     for (l = 0; l < gnni_ups(n); ++l) {
@@ -1990,7 +2298,7 @@ static void gnni_plan_places(gnn_unet *n, gnni_places *p, bool train)
     size_t end = 0, area = (size_t)d->width * d->height;
     uint32_t l;
     memset(p, 0, sizeof *p);
-    p->input = gnni_place(&end, gnn_map_floats(d->width, d->height, d->inputs));
+    p->input = gnni_place(&end, gnn_map_floats(d->width, d->height, gnn_stride(d->inputs)));
     for (l = 0; l < d->levels; ++l) {
         uint32_t w = d->width >> l, h = d->height >> l;
         size_t map = gnn_map_floats(w, h, gnn_stride(d->channels[l]));
@@ -2280,8 +2588,8 @@ static void gnni_take_input(const gnni_map *m, const float *planes)
     size_t area = (size_t)d->width * d->height, i;
     const float *b = planes + (d->inputs - 1) * area;
     float *map = m->w + m->at->input, *mask = m->w + m->at->mask;
-    uint32_t x, y, c;
-    gnn_map_from_planes(planes, d->width, d->height, d->inputs, d->inputs, map);
+    uint32_t x, y, c, stride = gnn_stride(d->inputs);
+    gnn_map_from_planes(planes, d->width, d->height, d->inputs, stride, map);
     if (d->no_mask)
         return;
     for (i = 0; i < area; ++i)
@@ -2289,8 +2597,8 @@ static void gnni_take_input(const gnni_map *m, const float *planes)
     for (y = 0; y < d->height; ++y)
         for (x = 0; x < d->width; ++x)
             for (c = 0; c < d->inputs && mask[(size_t)y * d->width + x] == 0; ++c)
-                map[gnni_at(d->width, d->inputs, x, y) + c] = 0;
-    gnn_map_halo(map, d->width, d->height, d->inputs);
+                map[gnni_at(d->width, stride, x, y) + c] = 0;
+    gnn_map_halo(map, d->width, d->height, stride);
 }
 
 /* Scales of a level's two convolutions; leaves the mask of the next level. */

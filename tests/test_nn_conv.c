@@ -175,6 +175,16 @@ static layer make_layer(int width, int height, int up, int in, int out, bool rel
     return l;
 }
 
+/* After a change of the layer's options. */
+static void layer_prepare(layer *l)
+{
+    free(l->prepared);
+    free(l->scratch);
+    l->prepared = new_floats(gnn_conv_prepared(&l->conv));
+    l->scratch = new_floats(gnn_conv_scratch(&l->conv));
+    gnn_conv_prepare(&l->conv, l->weights, l->prepared);
+}
+
 static void free_layer(layer *l)
 {
     void *all[] = {l->up_planes, l->in_planes,      l->kernel,   l->bias,   l->mask,  l->add,
@@ -205,15 +215,20 @@ static void forward(layer *l)
 typedef struct shape {
     int width, height, up, in, out;
     bool relu, masked, residual;
-} shape;
+} shape; /* 32x16 and the like have the 32 tiles from which on Winograd's method is used */
 
 /* Odd heights, widths with every remainder of a tile, channels that fill no vector. */
 static const shape shapes[] = {
-    {8, 4, 0, 3, 5, false, false, false},  {2, 1, 0, 1, 1, false, false, false}, {14, 7, 0, 5, 16, true, false, true},
-    {6, 3, 0, 8, 40, false, true, false},  {34, 5, 0, 17, 24, true, true, true}, {8, 4, 3, 2, 9, false, false, false},
-    {12, 6, 8, 0, 16, true, false, false}, {20, 2, 5, 7, 33, true, false, true}, {4, 2, 1, 1, 1, false, false, false},
+    {8, 4, 0, 3, 5, false, false, false},   {2, 1, 0, 1, 1, false, false, false},
+    {14, 7, 0, 5, 16, true, false, true},   {6, 3, 0, 8, 40, false, true, false},
+    {34, 5, 0, 17, 24, true, true, true},   {8, 4, 3, 2, 9, false, false, false},
+    {12, 6, 8, 0, 16, true, false, false},  {20, 2, 5, 7, 33, true, false, true},
+    {4, 2, 1, 1, 1, false, false, false},   {32, 16, 0, 5, 9, false, false, false},
+    {64, 8, 3, 17, 24, true, false, true},  {36, 16, 0, 16, 40, true, true, true},
+    {32, 20, 8, 0, 7, false, false, false},
 };
 #define SHAPES (sizeof shapes / sizeof *shapes)
+#define SMALL_SHAPES 9 /* before those for Winograd's method, which the backward pass does not use */
 
 static layer layer_of(const shape *s)
 {
@@ -232,7 +247,13 @@ static void convolution_is_its_definition_on_every_level(void **state)
         for (int k = 0; k < n; ++k) {
             l.conv.simd = list[k];
             forward(&l);
+            BELOW(map_error(l.out_map, l.conv.out_stride, l.expected, l.width, l.height, l.out), 5e-5);
+            l.conv.no_winograd = true;
+            layer_prepare(&l);
+            forward(&l);
             BELOW(map_error(l.out_map, l.conv.out_stride, l.expected, l.width, l.height, l.out), 1e-5);
+            l.conv.no_winograd = false;
+            layer_prepare(&l);
         }
         free_layer(&l);
     }
@@ -342,7 +363,7 @@ static void convolution_gradients_are_slopes_on_every_level(void **state)
     int n = levels(list);
     (void)state;
     for (int k = 0; k < n; ++k)
-        for (size_t i = 0; i < SHAPES; ++i) {
+        for (size_t i = 0; i < SMALL_SHAPES; ++i) {
             seed(2 + i);
             layer l = layer_of(&shapes[i]);
             l.conv.simd = list[k];
@@ -498,10 +519,13 @@ static void not_a_number_reaches_its_neighbours_only(void **state)
     gnn_simd list[4];
     int n = levels(list);
     (void)state;
-    for (int k = 0; k < n; ++k) {
+    for (int k = 0; k < 2 * n; ++k) {
+        int reach = k % 2 ? 1 : 4; /* of whoever shares a tile of 4x4 */
         seed(6);
         layer l = make_layer(40, 20, 0, 16, 16, false, false, false);
-        l.conv.simd = list[k];
+        l.conv.simd = list[k / 2];
+        l.conv.no_winograd = k % 2;
+        layer_prepare(&l);
         size_t total = gnn_map_floats(40, 20, 16);
         float *before = new_floats(total);
         forward(&l);
@@ -512,7 +536,7 @@ static void not_a_number_reaches_its_neighbours_only(void **state)
             for (int x = 0; x < 40; ++x)
                 for (int c = 0; c < 16; ++c) {
                     size_t at = (size_t)(((y + 1) * 42 + x + 1) * 16 + c);
-                    bool near = abs(x - 20) <= 1 && abs(y - 10) <= 1;
+                    bool near = abs(x - 20) <= reach && abs(y - 10) <= reach;
                     if (abs(x - 20) <= 1 && abs(y - 10) <= 1)
                         assert_true(l.out_map[at] != l.out_map[at]);
                     else
@@ -525,7 +549,7 @@ static void not_a_number_reaches_its_neighbours_only(void **state)
 
 static void shapes_that_do_not_fit_are_refused(void **state)
 {
-    gnn_conv good = {8, 4, 3, 8, 2, 8, 5, 8, true, GNN_SIMD_SCALAR}, c;
+    gnn_conv good = {8, 4, 3, 8, 2, 8, 5, 8, true, GNN_SIMD_SCALAR, false}, c;
     (void)state;
     assert_int_equal(gnn_conv_check(&good), GNN_OK);
 #define REFUSED(result, change)                                                                                        \
