@@ -215,7 +215,7 @@ static void forward(layer *l)
 typedef struct shape {
     int width, height, up, in, out;
     bool relu, masked, residual;
-} shape; /* 32x16 and the like have the 32 tiles from which on Winograd's method is used */
+} shape; /* 16x8 and more, multiples of 4, have the 8 tiles from which on Winograd's method is used */
 
 /* Odd heights, widths with every remainder of a tile, channels that fill no vector. */
 static const shape shapes[] = {
