@@ -34,7 +34,7 @@ AR ?= ar
 
 release_FLAGS := -O3 -DNDEBUG
 debug_FLAGS := -O0 -g
-scalar_FLAGS := -O2 -g -DGSD_NO_SIMD -DGKD_NO_SIMD
+scalar_FLAGS := -O2 -g -DGSD_NO_SIMD -DGKD_NO_SIMD -DGNN_NO_SIMD
 sanitize_FLAGS := -O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=undefined
 tsan_FLAGS := -O1 -g -fno-omit-frame-pointer -fsanitize=thread
 coverage_FLAGS := -O0 -g --coverage
@@ -86,7 +86,7 @@ TRACER_OBJ := $(TRACER_SRC:examples/tracer/%.c=$(B)/obj/tracer/%.o) $(if $(OPENP
 PROGRAMS := $(patsubst examples/tracer/%.c,$(B)/%,$(wildcard $(TRACER_MAINS:%=examples/tracer/%.c)))
 EXAMPLES := $(patsubst examples/%.c,$(B)/examples/%,$(wildcard examples/*.c))
 TESTS_ALL := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/test_*.c))
-MICRO := $(B)/bench_sdtree $(B)/bench_kd $(B)/bench_field $(B)/bench_denoise
+MICRO := $(B)/bench_sdtree $(B)/bench_kd $(B)/bench_field $(B)/bench_denoise $(B)/bench_nn
 BENCHES := $(patsubst bench/%.c,$(B)/%,$(wildcard bench/bench_*.c))
 STRESSES := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/stress_*.c))
 # Programs of bench/ that are not timings: `make bench` does not run them.
