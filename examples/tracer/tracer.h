@@ -504,6 +504,10 @@ typedef bool (*tr_photon_fn)(void *user, int tile, const tr_photon *photons, int
 /* Trace them. stats may be NULL, else they are added to. False = out of memory, here or there. */
 bool tr_trace_photons(const tr_photon_pass *pass, tr_photon_fn take, void *user, tr_photon_stats *stats);
 
+/* Add the irradiance (W/m^2) that the pass's photons bring, pixel by pixel, to a picture of 3 channels as the camera
+   sees it; a lens counts as a pinhole. To look at; no filter, so as noisy as the photons are. False = out of memory. */
+bool tr_photon_picture(const tr_photon_pass *pass, tr_image *picture);
+
 /* ---- >>method ----------------------------------------------------------------------------------------------- */
 
 typedef struct tr_option {
