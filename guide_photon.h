@@ -488,8 +488,8 @@ GPH_QUERY void gph_set_voxel(const gph_view *view, uint32_t voxel, gph_handle *h
     }
 }
 
-/* Find what to sample from at a position. normal (NULL = none, the full sphere): unit, on the side of the directions
-   wanted. u (NULL = none): 3 random numbers for a stochastic lookup. [any thread] */
+/* Find what to sample from at a position. normal (NULL or zero = none, the full sphere): unit, on the side of the
+   directions wanted. u (NULL = none): 3 random numbers for a stochastic lookup. [any thread] */
 GPH_QUERY void gph_find(const gph_view *view, const float position[3], const float *normal, const float *u,
                         gph_handle *handle)
 {
@@ -501,7 +501,7 @@ GPH_QUERY void gph_find(const gph_view *view, const float position[3], const flo
         voxel = near != GPH_NONE && view->voxels[near].map != GPH_NONE ? near : voxel;
     }
     gph_set_voxel(view, voxel, handle);
-    if (normal) {
+    if (normal && normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2] > 0.5f) {
         memcpy(handle->normal, normal, sizeof handle->normal);
         handle->surface = 1;
     }

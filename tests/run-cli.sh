@@ -153,6 +153,9 @@ done
 [ "$(grep -c '{' one.json)" -ge 1 ] && [ "$(tr -cd '{' <one.json | wc -c)" = "$(tr -cd '}' <one.json | wc -c)" ] &&
     ! grep -qE '\b(nan|inf)\b' one.json
 report $? 'JSON: braces match, no nan or inf'
+completes 'writes what photons bring' good.xml --spp 1 --quiet --size 32x18 --photon-png photons.png
+[ "$(head -c 4 photons.png | od -An -tx1 | tr -d ' ')" = 89504e47 ] && ! cmp -s photons.png one.png
+report $? 'PNG of photons begins with its magic number'
 completes '--reference: measures' good.xml --spp 4 --quiet --seed 7 --reference one.exr --json ref.json
 cp ref.json log 2>/dev/null
 grep -qE '"relmse"[[:space:]]*:[[:space:]]*[0-9]' ref.json && grep -qE '"mrae"[[:space:]]*:[[:space:]]*[0-9]' ref.json
@@ -164,6 +167,7 @@ printf 'not an image' >bad.exr
 refuses '--reference unreadable' 'bad\.exr' good.xml $quick --reference bad.exr
 refuses 'unwritable output names it' 'absent/x\.exr' good.xml $quick -o absent/x.exr
 refuses 'unwritable PNG names it' 'absent/x\.png' good.xml $quick --png absent/x.png
+refuses 'unwritable PNG of photons names it' 'absent/y\.png' good.xml $quick --photon-png absent/y.png
 refuses 'unwritable JSON names it' 'absent/x\.json' good.xml $quick --json absent/x.json
 
 # ---- the same picture for any number of threads

@@ -1041,7 +1041,7 @@ static vec3 random_direction(tr_rng *rng)
     return sample_uniform_sphere(a, b);
 }
 
-/* Rocks and rolls: any normals, and a bump map where `bumped`. */
+/* A surface of one bsdf, with a bump map where `bumped`; two-sided where it does not transmit. */
 static tr_scene *one_bsdf(tr_bsdf_type type, bool bumped, int *id)
 {
     tr_scene *s = scene_new();
@@ -1228,7 +1228,7 @@ static void passes_hand_photons_to_the_method(void **state)
     }
     assert_int_equal(result.photons, photons);
     assert_true(result.photon_rays >= photons);
-    /* both rounds together carry the light's power: half of what arrives is absorbed; 4 pi W at first, 2 pi ... */
+    /* both rounds together carry the light's power: half of what arrives is absorbed */
     assert_true(fabs(0.5 * flux / (4 * PI) - 1) < 0.01);
     /* the picture knows nothing of it */
     assert_memory_equal(plain.color.data, result.color.data, sizeof(float) * 32 * 32 * 3);
@@ -1238,6 +1238,38 @@ static void passes_hand_photons_to_the_method(void **state)
     the_shooter.fail = 1;
     assert_false(tr_render(s, &settings, &result, err, sizeof err));
     assert_non_null(strstr(err, "memory"));
+    tr_scene_free(s);
+}
+
+/* The picture of a plane across the view holds all the flux that arrives there, seen where the camera sees it. */
+static void the_picture_holds_the_flux(void **state)
+{
+    (void)state;
+    tr_scene *s = scene_new();
+    add_floor(s, 2);
+    mat4 blind = placed(v3(0.3f, 0.5f, 0), v3(1, 0, 0), -90, v3s(0.1f)); /* hides a part of the floor, faces up */
+    assert_true(tr_shape_rectangle(add_shape(s, GRAY), &blind));
+    add_point(s, WARM, v3(0, 3, 0));
+    s->camera.to_world = (mat4){{{1, 0, 0, 0}, {0, 0, -1, 2}, {0, 1, 0, 0}, {0, 0, 0, 1}}};
+    s->camera.fov = (float)(2 * atan(0.5) * 180 / PI); /* |x|, |z| < 1 on the floor */
+    s->camera.fov_axis = 0;
+    scene_done(s);
+    tr_image picture;
+    assert_true(tr_image_alloc(&picture, 20, 20, 3));
+    tr_photon_pass pass = pass_of(s, 1 << 20, 2, true);
+    assert_true(tr_photon_picture(&pass, &picture));
+    /* the blind and its shadow lie before the floor's 0.2 .. 0.6 */
+    double sum = 0, hidden = 0, shown = 0;
+    for (int i = 0; i < 20; ++i)
+        for (int j = 0; j < 20; ++j) {
+            double value = picture.data[3 * (20 * j + i)] * 0.01, x = 1 - (i + 0.5) / 10, z = 1 - (j + 0.5) / 10;
+            bool behind = fabs(x - 0.4) < 0.2 && fabs(z) < 0.2;
+            *(behind ? &hidden : &sum) += value;
+            shown += behind ? 0 : 0.01 * WARM.x * 3 / pow(9 + x * x + z * z, 1.5);
+        }
+    assert_true(fabs(sum / shown - 1) < 0.025); /* 35,000 photons: 4.5 sigma */
+    assert_true(hidden > 0.5 * shown * 16 / 384);
+    tr_image_free(&picture);
     tr_scene_free(s);
 }
 
@@ -1384,6 +1416,7 @@ int main(void)
         cmocka_unit_test(adjoint_is_the_way_back),
         cmocka_unit_test(smooth_glass_keeps_flux),
         cmocka_unit_test(passes_hand_photons_to_the_method),
+        cmocka_unit_test(the_picture_holds_the_flux),
         cmocka_unit_test(no_light_no_photons),
         cmocka_unit_test(nothing_arrives_where_nothing_scatters),
         cmocka_unit_test(extreme_lights_make_no_nan),

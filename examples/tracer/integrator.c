@@ -150,7 +150,7 @@ static float filter_offset(tr_filter filter, float u1, float u2)
     return u1 - 0.5f;
 }
 
-static float tan_half_fov_x(const tr_camera *camera, float aspect)
+float tr_tan_half_fov_x(const tr_camera *camera, float aspect)
 {
     float t = tanf(0.5f * camera->fov * (TR_PI / 180.0f));
     switch (camera->fov_axis) {
@@ -174,7 +174,7 @@ static void camera_ray(const tr_frame *frame, path *p)
     float u[6];
     for (int i = 0; i < 6; ++i)
         u[i] = rng_float(&p->rng);
-    float aspect = (float)frame->width / (float)frame->height, tx = tan_half_fov_x(camera, aspect);
+    float aspect = (float)frame->width / (float)frame->height, tx = tr_tan_half_fov_x(camera, aspect);
     float sx = ((float)p->x + 0.5f + filter_offset(filter, u[0], u[2])) / (float)frame->width;
     float sy = ((float)p->y + 0.5f + filter_offset(filter, u[1], u[3])) / (float)frame->height;
     vec3 d = v3((1 - 2 * sx) * tx, (1 - 2 * sy) * tx / aspect, 1); /* camera space: +x is left */
@@ -706,6 +706,7 @@ static void fill_vertex(tr_worker *w, const tr_frame *frame, int id, const choic
     v->pdf_guide = v->alpha < 1 ? smooth * w->pdf_guide[k] : 0;
     v->u = 0;
     v->flags = (p->seen ? 0 : TR_VERTEX_FIRST) | (c->transmits ? TR_VERTEX_PASSES : 0);
+    v->flags |= ch->kind == CHOICE_GUIDE ? TR_VERTEX_GUIDED : 0;
     if (black3(ch->f))
         v->flags |= TR_VERTEX_REJECTED;
     v->pixel_weight = throughput;

@@ -77,6 +77,8 @@ typedef struct tr_counters {
 
 typedef struct tr_worker tr_worker;
 
+float tr_tan_half_fov_x(const tr_camera *camera, float aspect); /* aspect: width over height */
+
 tr_worker *tr_worker_create(const tr_frame *frame);
 void tr_worker_destroy(tr_worker *worker);
 tr_counters *tr_worker_counters(tr_worker *worker);

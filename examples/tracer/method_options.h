@@ -61,7 +61,7 @@ static double number(parser *p, const char *key, double fallback)
 }
 
 /* Whether a tile's paths are worth recording: every 1 / fraction-th, starting elsewhere in every pass. */
-static bool tile_records(int pass, float fraction, int tile)
+static inline bool tile_records(int pass, float fraction, int tile)
 {
     double start = pass * 0.6180339887 + tile * (double)fraction;
     return floor(start + (double)fraction) > floor(start);

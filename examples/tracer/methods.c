@@ -16,7 +16,7 @@ static void *pt_create(tr_method_env *env, char *err, size_t err_size)
 static const tr_method pt_method = {
     .name = "pt", .summary = "path tracing with BSDF sampling only", .create = pt_create, .destroy = free};
 
-extern const tr_method tr_method_sdtree, tr_method_kd;
+extern const tr_method tr_method_sdtree, tr_method_kd, tr_method_photon;
 
 #ifdef TR_OPENPGL
 extern const tr_method tr_method_openpgl;
@@ -35,7 +35,8 @@ static const tr_method tr_method_openpgl = {.name = "openpgl",
                                             .destroy = free};
 #endif
 
-static const tr_method *const methods[] = {&pt_method, &tr_method_sdtree, &tr_method_kd, &tr_method_openpgl, NULL};
+static const tr_method *const methods[] = {&pt_method,        &tr_method_sdtree,  &tr_method_kd,
+                                           &tr_method_photon, &tr_method_openpgl, NULL};
 
 const tr_method *const *tr_method_list(void) { return methods; }
 

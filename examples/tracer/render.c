@@ -19,7 +19,7 @@
 
 typedef struct options {
     tr_settings settings;
-    const char *scene, *method, *out, *png, *json, *reference;
+    const char *scene, *method, *out, *png, *json, *reference, *photons;
     tr_option set[MAX_OPTIONS];
     tr_define defines[MAX_OPTIONS];
     int define_count;
@@ -44,6 +44,7 @@ static const char usage_text[] =
     "  --reference R.exr     print errors against R; R may be larger by a whole factor\n"
     "  -o OUT.exr            layers: color, variance, albedo, normal, alpha, cell, depth\n"
     "  --png OUT.png         tone-mapped picture   [--exposure E]\n"
+    "  --photon-png OUT.png  irradiance by a million photon paths, unfiltered\n"
     "  --json FILE           statistics\n"
     "  --quiet               no progress\n";
 
@@ -91,6 +92,8 @@ static bool apply(options *o, const char *name, char *value, bool *known)
         o->out = value;
     else if (!strcmp(name, "--png"))
         o->png = value;
+    else if (!strcmp(name, "--photon-png"))
+        o->photons = value;
     else if (!strcmp(name, "--json"))
         o->json = value;
     else if (!strcmp(name, "--reference"))
@@ -309,7 +312,23 @@ static bool measure(const char *path, const tr_image *image, tr_error *e, char *
     return ok;
 }
 
-static int write_outputs(const options *o, const tr_result *r)
+static bool write_photons(const options *o, const tr_scene *scene, const tr_image *like, char *err, size_t err_size)
+{
+    const tr_settings *s = &o->settings;
+    const uint32_t paths = 1u << 20;
+    tr_image picture;
+    tr_photon_pass pass = {.scene = scene, .seed = s->seed, .total = paths, .count = paths, .nee = !s->no_nee};
+    pass.max_depth = s->max_depth > 0 ? s->max_depth : scene->max_depth;
+    snprintf(err, err_size, "out of memory");
+    if (!tr_image_alloc(&picture, like->width, like->height, 3))
+        return false;
+    bool ok =
+        tr_photon_picture(&pass, &picture) && tr_png_write(o->photons, &picture, (float)o->exposure, err, err_size);
+    tr_image_free(&picture);
+    return ok;
+}
+
+static int write_outputs(const options *o, const tr_scene *scene, const tr_result *r)
 {
     char err[512] = "";
     tr_error e;
@@ -324,6 +343,8 @@ static int write_outputs(const options *o, const tr_result *r)
         rc = die("%s: cannot write the picture: %s", o->out, err);
     if (o->png && !tr_png_write(o->png, &r->color, (float)o->exposure, err, sizeof err))
         rc = die("%s: cannot write the picture: %s", o->png, err);
+    if (o->photons && !write_photons(o, scene, &r->color, err, sizeof err))
+        rc = die("%s: cannot write the picture: %s", o->photons, err);
     if (o->json && !write_json(o->json, o, r, measured ? &e : NULL))
         rc = die("%s: cannot write the statistics: %s", o->json, strerror(errno));
     if (!o->quiet) {
@@ -352,8 +373,8 @@ static int write_outputs(const options *o, const tr_result *r)
 /* An output that cannot be written is better known before the render than after it. */
 static int check_outputs(const options *o)
 {
-    const char *paths[] = {o->out, o->png, o->json};
-    for (int i = 0; i < 3; ++i) {
+    const char *paths[] = {o->out, o->png, o->json, o->photons};
+    for (size_t i = 0; i < sizeof paths / sizeof *paths; ++i) {
         if (!paths[i] || !strcmp(paths[i], "-"))
             continue;
         FILE *f = fopen(paths[i], "ab");
@@ -392,7 +413,7 @@ int main(int argc, char **argv)
     if (!tr_render(scene, &o.settings, &result, err, sizeof err))
         rc = die("%s: %s", o.scene, err);
     else {
-        rc = write_outputs(&o, &result);
+        rc = write_outputs(&o, scene, &result);
         tr_result_free(&result);
     }
     tr_scene_free(scene);

@@ -451,6 +451,7 @@ typedef struct tr_vertex {
 #define TR_VERTEX_REJECTED 1u /* the direction was refused before tracing: f = 0, L = 0 */
 #define TR_VERTEX_FIRST 2u    /* first non-delta vertex seen by the camera */
 #define TR_VERTEX_PASSES 4u   /* light also passes through: directions on both sides of ns */
+#define TR_VERTEX_GUIDED 8u   /* the direction was drawn by the guide */
 
 /* ---- >>photon ----------------------------------------------------------------------------------------------- */
 
@@ -503,6 +504,10 @@ static inline int tr_photon_tiles(uint32_t count) { return (int)((count + TR_PHO
 typedef bool (*tr_photon_fn)(void *user, int tile, const tr_photon *photons, int n);
 /* Trace them. stats may be NULL, else they are added to. False = out of memory, here or there. */
 bool tr_trace_photons(const tr_photon_pass *pass, tr_photon_fn take, void *user, tr_photon_stats *stats);
+
+/* Add the irradiance (W/m^2) that the pass's photons bring, pixel by pixel, to a picture of 3 channels as the camera
+   sees it; a lens counts as a pinhole. To look at; no filter, so as noisy as the photons are. False = out of memory. */
+bool tr_photon_picture(const tr_photon_pass *pass, tr_image *picture);
 
 /* ---- >>method ----------------------------------------------------------------------------------------------- */
 

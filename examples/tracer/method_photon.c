@@ -1,0 +1,285 @@
+/* method_photon.c: guide_photon.h as a method of the example renderer.
+
+   Options (--set key=value), defaults as in guide_photon.h: photons (photon paths per camera path, 0 .. 16, default 1),
+   repair=none|gaussian|pyramid|pull_push, sigma (bins), pyramid_levels, rows=16|32|64, grid (cubes along the longest
+   side of the scene), c (photons before a voxel splits), max_levels, keep_passes, max_memory_mb,
+   learn_alpha=ratio|variance|off (on = variance), alpha, gate=on|off, gate_margin, gate_probe, uniform, surface=on|off
+   (what lies below the surface is mirrored up), jitter=on|off (find looks up a jittered position).
+
+   A pass's photons are traced before its camera paths, so the first pass has none: no voxel is valid yet. While no
+   voxel guides, only every fourth pass has some. */
+#include "method_options.h"
+
+#define GPH_IMPLEMENTATION
+#include "guide_photon.h"
+
+#define IDLE_PASSES 4 /* between two passes with photons where no voxel guides */
+
+typedef struct photon {
+    gph_field *field;
+    gph_view view;
+    gph_stream **streams; /* of camera paths; those of photons follow */
+    int tiles, photon_tiles;
+    bool surface, jitter;
+    double per_path, paths; /* photon paths per camera path; camera paths of one sample per pixel */
+    double flux; /* of a photon of this pass: its power times the pass's paths, so that all paths count alike */
+    uint64_t stream_peak;
+    tr_parallel_fn parallel;
+    void *parallel_user;
+} photon;
+
+/* ---- options */
+
+static bool parse(parser *p, gph_desc *d, photon *m)
+{
+    int learn;
+    m->per_path = number(p, "photons", 1);
+    if (m->per_path > 16)
+        complain(p, "photons", option(p->env, "photons"), "0 .. 16");
+    d->repair = (gph_repair)(choice(p, "repair", "none|gaussian|pyramid|pull_push") + 1);
+    d->sigma = (float)number(p, "sigma", 0);
+    d->pyramid_levels = (uint32_t)number(p, "pyramid_levels", 0);
+    d->rows = (uint32_t)number(p, "rows", 0);
+    d->grid_cells = (uint32_t)number(p, "grid", 0);
+    d->split_photons = (float)number(p, "c", 0);
+    d->max_levels = (uint32_t)number(p, "max_levels", 0);
+    d->keep_passes = (uint32_t)number(p, "keep_passes", 0);
+    d->max_bytes = (uint64_t)(number(p, "max_memory_mb", 0) * 1048576.0);
+    learn = choice(p, "learn_alpha", "off|ratio|variance|on");
+    d->alpha_mode = (gph_alpha_mode)(learn == 3 ? GPH_ALPHA_VARIANCE : learn + 1);
+    d->alpha = (float)number(p, "alpha", 0);
+    d->uniform = (float)number(p, "uniform", 0);
+    d->no_gate = choice(p, "gate", "off|on") == 0;
+    d->gate_margin = (float)number(p, "gate_margin", 0);
+    d->gate_probe = (uint32_t)number(p, "gate_probe", 0);
+    m->surface = choice(p, "surface", "off|on") != 0;
+    m->jitter = choice(p, "jitter", "off|on") == 1;
+    return p->ok;
+}
+
+/* ---- life */
+
+static void photon_destroy(void *method)
+{
+    photon *m = method;
+    if (!m)
+        return;
+    for (int i = 0; m->streams && i < m->tiles + m->photon_tiles; ++i)
+        gph_stream_destroy(m->streams[i]);
+    free(m->streams);
+    gph_destroy(m->field);
+    free(m);
+}
+
+static void *photon_create(tr_method_env *env, char *err, size_t err_size)
+{
+    photon *m = calloc(1, sizeof *m);
+    gph_desc desc;
+    parser p = {env, err, err_size, true};
+    const vec3 lo = env->scene->bounds_min, hi = env->scene->bounds_max;
+    memset(&desc, 0, sizeof desc);
+    snprintf(err, err_size, "out of memory");
+    if (!m)
+        return NULL;
+    memcpy(desc.bounds_min, &lo, sizeof desc.bounds_min);
+    memcpy(desc.bounds_max, &hi, sizeof desc.bounds_max);
+    m->tiles = env->tiles;
+    m->photon_tiles = env->photon_tiles;
+    m->parallel = env->parallel;
+    m->parallel_user = env->parallel_user;
+    m->paths = (double)env->width * env->height;
+    if (!parse(&p, &desc, m)) {
+        photon_destroy(m);
+        return NULL;
+    }
+    gph_result result = gph_create(&desc, &m->field);
+    int streams = m->tiles + m->photon_tiles;
+    m->streams = result ? NULL : calloc((size_t)streams, sizeof *m->streams);
+    for (int i = 0; m->streams && i < streams && !result; ++i)
+        result = gph_stream_create(m->field, &m->streams[i]);
+    if (result || !m->streams) {
+        snprintf(err, err_size, "photon: %s", gph_result_string(result ? result : GPH_OUT_OF_MEMORY));
+        photon_destroy(m);
+        return NULL;
+    }
+    m->view = gph_get_view(m->field);
+    return m;
+}
+
+/* ---- passes */
+
+static bool photon_begin_pass(void *method, const tr_pass *pass)
+{
+    (void)method;
+    return !pass->last;
+}
+
+static uint64_t photon_wants_photons(void *method, const tr_pass *pass)
+{
+    photon *m = method;
+    gph_stats s;
+    gph_get_stats(m->field, &s);
+    if (pass->last || s.valid == 0 || (s.maps > 0 && gph_all_closed(m->field) && pass->index % IDLE_PASSES != 0))
+        return 0;
+    m->flux = floor(m->per_path * m->paths * pass->spp + 0.5);
+    return (uint64_t)m->flux;
+}
+
+static gph_vertex convert(const tr_vertex *v)
+{
+    float p[3], contribution = v->cosine * (v->f.x * v->L.x + v->f.y * v->L.y + v->f.z * v->L.z) / 3;
+    memcpy(p, &v->p, sizeof p);
+    if (v->flags & TR_VERTEX_REJECTED)
+        contribution = 0;
+    return gph_make_vertex(p, contribution, v->pdf_mix, v->pdf_bsdf, v->pdf_guide,
+                           v->flags & TR_VERTEX_GUIDED ? GPH_FROM_GUIDE : GPH_FROM_BSDF);
+}
+
+static bool photon_record(void *method, int tile, const tr_vertex *vertices, int n)
+{
+    photon *m = method;
+    gph_vertex samples[64];
+    bool ok = true;
+    for (int done = 0; done < n;) {
+        int k = 0;
+        for (; k < 64 && done < n; ++k, ++done)
+            samples[k] = convert(&vertices[done]);
+        ok = !gph_record_vertices(m->streams[tile], samples, (uint32_t)k) && ok;
+    }
+    return ok;
+}
+
+/* Those that next-event estimation finds anyhow, and those that no camera path can find, are of no use. */
+static bool photon_record_photons(void *method, int tile, const tr_photon *photons, int n)
+{
+    photon *m = method;
+    gph_photon samples[64];
+    bool ok = true;
+    for (int done = 0; done < n;) {
+        int k = 0;
+        for (; k < 64 && done < n; ++done) {
+            const tr_photon *p = &photons[done];
+            float at[3], from[3];
+            if (p->flags)
+                continue;
+            memcpy(at, &p->p, sizeof at);
+            memcpy(from, &p->wi, sizeof from);
+            samples[k++] = gph_make_photon(at, from, p->distance,
+                                           (float)((double)((p->flux.x + p->flux.y + p->flux.z) / 3) * m->flux));
+        }
+        ok = !gph_record_photons(m->streams[m->tiles + tile], samples, (uint32_t)k) && ok;
+    }
+    return ok;
+}
+
+static void photon_flush(void *method)
+{
+    photon *m = method;
+    int streams = m->tiles + m->photon_tiles;
+    uint64_t bytes = 0;
+    for (int i = 0; i < streams; ++i)
+        bytes += gph_stream_size(m->streams[i]) * sizeof(gph_vertex);
+    m->stream_peak = bytes > m->stream_peak ? bytes : m->stream_peak;
+    gph_accumulate(m->field, m->streams, (uint32_t)streams, m->parallel, m->parallel_user); /* losses: in the stats */
+    for (int i = 0; i < streams; ++i)
+        gph_stream_clear(m->streams[i]);
+}
+
+static bool photon_end_pass(void *method, const tr_pass *pass)
+{
+    photon *m = method;
+    if (pass->last)
+        return true;
+    photon_flush(m);
+    gph_result result = gph_refine(m->field, m->parallel, m->parallel_user);
+    m->view = gph_get_view(m->field);
+    return !result;
+}
+
+/* ---- queries */
+
+static bool photon_idle(void *method)
+{
+    const photon *m = method;
+    return gph_all_closed(m->field);
+}
+
+static void photon_find(void *method, const tr_lookup *lookup, void *handles, float *alpha)
+{
+    const photon *m = method;
+    gph_find_batch(&m->view, (uint32_t)lookup->n, NULL, &lookup->p->x, sizeof(vec3),
+                   m->surface ? &lookup->side->x : NULL, sizeof(vec3), m->jitter && lookup->u ? lookup->u[0] : NULL,
+                   sizeof lookup->u[0], handles, alpha);
+}
+
+/* Index lists of ints are lists of uint32_t: the two types may alias, and no index is negative. */
+static void photon_sample(void *method, int n, const int *index, const void *handles, const float (*u)[2], vec3 *wi,
+                          float *pdf)
+{
+    const photon *m = method;
+    gph_sample_batch(&m->view, (uint32_t)n, (const uint32_t *)index, handles, u[0], sizeof u[0], &wi->x, sizeof *wi,
+                     pdf);
+}
+
+static void photon_pdf(void *method, int n, const int *index, const void *handles, const vec3 *wi, float *pdf)
+{
+    const photon *m = method;
+    gph_pdf_batch(&m->view, (uint32_t)n, (const uint32_t *)index, handles, &wi->x, sizeof *wi, pdf);
+}
+
+/* ---- reports */
+
+/* Voxel number, and how many photons it has seen. */
+static void photon_describe(void *method, int n, const void *handles, float *cell, float *depth)
+{
+    const photon *m = method;
+    const gph_handle *h = handles;
+    for (int i = 0; i < n; ++i) {
+        bool none = h[i].voxel == GPH_NONE;
+        cell[i] = none ? 0 : (float)h[i].voxel;
+        depth[i] = none ? 0 : m->view.voxels[h[i].voxel].photons;
+    }
+}
+
+static void photon_stats(void *method, tr_method_stats *stats)
+{
+    const photon *m = method;
+    gph_stats s;
+    gph_get_stats(m->field, &s);
+    memset(stats, 0, sizeof *stats);
+    stats->samples = s.vertices;
+    stats->refused = s.refused;
+    stats->cells = s.voxels;
+    stats->bytes = s.bytes;
+    stats->extra_bytes = (double)m->stream_peak;
+    snprintf(stats->json, sizeof stats->json,
+             "\"passes\": %u, \"clamped\": %llu, \"lost\": %llu, \"denied\": %llu, \"kept_photons\": %llu, "
+             "\"cubes\": %u, \"maps\": %u, \"valid\": %u, \"sparse\": %u, \"levels\": %u, \"splits\": %llu, "
+             "\"recycled\": %llu, \"built\": %llu, \"skipped\": %llu, \"open_voxels\": %u, \"closed_voxels\": %u, "
+             "\"unjudged_voxels\": %u, \"opened\": %llu, \"closed\": %llu, \"probed\": %llu, \"closed_share\": %.4f, "
+             "\"mean_alpha\": %.4f, \"useful_share\": %.4f",
+             s.passes, (unsigned long long)s.clamped, (unsigned long long)s.lost, (unsigned long long)s.denied,
+             (unsigned long long)s.photons, s.cubes, s.maps, s.valid, s.sparse, s.levels, (unsigned long long)s.splits,
+             (unsigned long long)s.recycled, (unsigned long long)s.built, (unsigned long long)s.skipped, s.open_voxels,
+             s.closed_voxels, s.unjudged_voxels, (unsigned long long)s.opened, (unsigned long long)s.closed,
+             (unsigned long long)s.probed, (double)s.closed_share, (double)s.mean_alpha, (double)s.useful_share);
+}
+
+const tr_method tr_method_photon = {.name = "photon",
+                                    .summary = "histograms of photons in a hash grid (guide_photon.h)",
+                                    .handle_size = sizeof(gph_handle),
+                                    .learns = true,
+                                    .create = photon_create,
+                                    .destroy = photon_destroy,
+                                    .begin_pass = photon_begin_pass,
+                                    .idle = photon_idle,
+                                    .find = photon_find,
+                                    .sample = photon_sample,
+                                    .pdf = photon_pdf,
+                                    .record = photon_record,
+                                    .wants_photons = photon_wants_photons,
+                                    .record_photons = photon_record_photons,
+                                    .flush = photon_flush,
+                                    .end_pass = photon_end_pass,
+                                    .describe = photon_describe,
+                                    .stats = photon_stats};
