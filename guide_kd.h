@@ -1178,85 +1178,102 @@ typedef struct gkdi_shape {
 
 /* x >= 0 as f32, at most 3e38. */
 static float gkdi_float_of(double x) { return x < 3e38 ? (float)x : 3e38f; }
+static float gkdi_lit_of(double x) { return x < (double)GKDI_LIT_MAX ? (float)x : GKDI_LIT_MAX; }
 
-/* Light of one sample: all but its position. value = L >= 0, finite; of zeros, direction is not read. */
-static void gkdi_signature_light(gkd_signature *s, const float *direction, float value)
-{
-    double v = (double)value;
-    uint32_t k;
-    s->samples += 1;
-    if (!(value > 0))
-        return;
-    s->sum += v;
-    s->squares += v * v;
-    for (k = 0; k < 3; ++k)
-        s->direction[k] += v * (double)direction[k];
-}
+/* Sums of a batch, before they become part of signatures: of a lookahead cell and of the cells about it. */
+typedef struct gkdi_sum {
+    double samples, sum, squares, direction[3]; /* as in gkd_signature */
+    double lit, away[3], square[3];             /* non-zero samples, their positions from a reference point */
+} gkdi_sum;
 
-/* One sample; of zeros, the position is not read. */
-static void gkdi_signature_add(gkd_signature *s, const float position[3], const float *direction, float value)
+/* Add the light of items[list[0 .. count - 1]], all of them non-zero. */
+static void gkdi_sum_light(gkdi_sum *sum, gkdi_shape *shape, const gkdi_item *items, const uint32_t *list,
+                           uint32_t count)
 {
-    double n, gain, window;
-    uint32_t k;
-    gkdi_signature_light(s, direction, value);
-    if (!(value > 0))
-        return;
-    if (s->lit < GKDI_LIT_MAX)
-        s->lit += 1;
-    n = (double)s->lit;
-    gain = 1 / n;
-    window = n < GKDI_VARIANCE_WINDOW ? gain : 1.0 / GKDI_VARIANCE_WINDOW;
-    for (k = 0; k < 3; ++k) {
-        double away = (double)position[k] - s->mean[k], spread = (double)s->variance[k];
-        s->mean[k] += away * gain;
-        spread += (away * ((double)position[k] - s->mean[k]) - spread) * window;
-        s->variance[k] = gkdi_float_of(spread);
-    }
-}
-
-/* Of the cell itself only, not of its lookahead cells. */
-static void gkdi_shape_add(gkdi_shape *s, const float direction[3], float value)
-{
-    double v = (double)value, x = (double)direction[0] * v, y = (double)direction[1] * v, z = (double)direction[2] * v;
-    s->s[0] += x * x;
-    s->s[1] += y * y;
-    s->s[2] += z * z;
-    s->s[3] += x * y;
-    s->s[4] += x * z;
-    s->s[5] += y * z;
-}
-
-/* Many non-zero samples, in registers; positions count as if they had come one by one, but
-   for the window of their variance. */
-static void gkdi_signature_add_all(gkd_signature *s, gkdi_shape *shape, const gkdi_item *items, uint32_t count)
-{
-    gkd_signature t = *s;
-    gkdi_shape h = *shape;
-    double far[3] = {0, 0, 0}, square[3] = {0, 0, 0}, from[3], m = (double)count, old = (double)t.lit, n;
+    double light[5] = {0, 0, 0, 0, 0}, s[6] = {0, 0, 0, 0, 0, 0};
     uint32_t i, k;
-    if (!count)
-        return;
-    for (k = 0; k < 3; ++k)
-        from[k] = t.lit > 0 ? t.mean[k] : (double)items[0].position[k];
     for (i = 0; i < count; ++i) {
-        gkdi_signature_light(&t, items[i].direction, items[i].weight);
-        gkdi_shape_add(&h, items[i].direction, items[i].weight);
+        const gkdi_item *p = &items[list[i]];
+        double v = (double)p->weight, x = (double)p->direction[0] * v, y = (double)p->direction[1] * v;
+        double z = (double)p->direction[2] * v;
+        light[0] += v;
+        light[1] += v * v;
+        light[2] += x;
+        light[3] += y;
+        light[4] += z;
+        s[0] += x * x;
+        s[1] += y * y;
+        s[2] += z * z;
+        s[3] += x * y;
+        s[4] += x * z;
+        s[5] += y * z;
+    }
+    sum->samples += count;
+    sum->sum += light[0];
+    sum->squares += light[1];
+    for (k = 0; k < 3; ++k)
+        sum->direction[k] += light[2 + k];
+    for (k = 0; k < 6; ++k)
+        shape->s[k] += s[k];
+}
+
+/* Add their positions, as seen from a reference point. Loops of their own: sums stay in registers. */
+static void gkdi_sum_places(gkdi_sum *sum, const double from[3], const gkdi_item *items, const uint32_t *list,
+                            uint32_t count)
+{
+    double away[3] = {0, 0, 0}, square[3] = {0, 0, 0};
+    uint32_t i, k;
+    for (i = 0; i < count; ++i) {
+        const float *p = items[list[i]].position;
         for (k = 0; k < 3; ++k) {
-            double away = (double)items[i].position[k] - from[k];
-            far[k] += away;
-            square[k] += away * away;
+            double x = (double)p[k] - from[k];
+            away[k] += x;
+            square[k] += x * x;
         }
     }
-    t.lit = gkd_least(t.lit + (float)count, GKDI_LIT_MAX);
-    n = fmin(old, GKDI_VARIANCE_WINDOW) + m;
+    sum->lit += count;
     for (k = 0; k < 3; ++k) {
-        double mean = far[k] / m, spread = square[k] - far[k] * mean;
-        t.mean[k] = from[k] + far[k] / fmax((double)t.lit, m);
-        spread = (spread > 0 ? spread : 0) + (n - m) * ((double)t.variance[k] + mean * mean * m / n);
-        t.variance[k] = gkdi_float_of(spread / n);
+        sum->away[k] += away[k];
+        sum->square[k] += square[k];
     }
-    *s = t;
-    *shape = h;
+}
+
+static void gkdi_sum_add(gkdi_sum *sum, const gkdi_sum *other)
+{
+    uint32_t k;
+    sum->samples += other->samples;
+    sum->sum += other->sum;
+    sum->squares += other->squares;
+    sum->lit += other->lit;
+    for (k = 0; k < 3; ++k) {
+        sum->direction[k] += other->direction[k];
+        sum->away[k] += other->away[k];
+        sum->square[k] += other->square[k];
+    }
+}
+
+/* Make a batch part of a signature. Positions count as if they had come one by one, but for the window of their
+   variance. */
+static void gkdi_signature_add(gkd_signature *s, const gkdi_sum *b, const double from[3])
+{
+    double old = fmin((double)s->lit, GKDI_VARIANCE_WINDOW), m = b->lit, n = old + m;
+    bool first = !(s->lit > 0);
+    uint32_t k;
+    s->samples += b->samples;
+    s->sum += b->sum;
+    s->squares += b->squares;
+    for (k = 0; k < 3; ++k)
+        s->direction[k] += b->direction[k];
+    if (!(m > 0))
+        return;
+    s->lit = gkdi_lit_of((double)s->lit + m);
+    for (k = 0; k < 3; ++k) {
+        double mean = b->away[k] / m, spread = b->square[k] - b->away[k] * mean;
+        double move = from[k] + mean - (first ? 0 : s->mean[k]);
+        spread = (spread > 0 ? spread : 0) + (first ? 0 : old * ((double)s->variance[k] + move * move * m / n));
+        s->mean[k] = first ? move : s->mean[k] + move * m / fmax((double)s->lit, m);
+        s->variance[k] = gkdi_float_of(spread / n);
+    }
 }
 
 /* Let what was seen so far count for `factor` of its samples [Zheng 2025, section 7.2]. All signatures that are
@@ -1278,8 +1295,6 @@ static void gkdi_shape_scale(gkdi_shape *s, double factor)
     for (k = 0; k < 6; ++k)
         s->s[k] *= factor;
 }
-
-static double gkdi_signature_count(const gkd_signature *s) { return s->samples; }
 
 /* Mean position of the non-zero samples. */
 static void gkdi_signature_mean(const gkd_signature *s, float mean[3])
@@ -3145,10 +3160,12 @@ typedef struct gkdi_update {
     uint32_t outcome_count;
 } gkdi_update;
 
-/* The samples of one cell: items are non-zero, zeros only have a position. Two arrays each, for stable partitions. */
+/* The samples of one cell: items are non-zero, zeros only have a position. Two arrays of each, and of lists of items,
+   for stable partitions. */
 typedef struct gkdi_cell_samples {
     gkdi_item *items, *other_items;
     float (*zeros)[3], (*other_zeros)[3];
+    uint32_t *list, *other_list; /* of items */
 } gkdi_cell_samples;
 
 static uint64_t gkdi_cell_bytes(const gkdi_cell *c)
@@ -3193,53 +3210,153 @@ static uint32_t gkdi_look_room(const gkd_desc *desc, uint32_t count)
     return n < most ? n : most;
 }
 
-/* Add one sample to a lookahead cell, or the cell itself, and those below in which it lies. Where the last of them has
-   enough samples and levels and room are left, it is divided: later samples go on below, and where positions lie counts
-   there only. */
-static void gkdi_look_add(const gkd_desc *desc, gkdi_cell *c, uint32_t node, const float position[3],
-                          const float *direction, float value)
+/* Stable partition of a range by a plane; the first part's end. */
+static uint32_t gkdi_cut_items(gkdi_cell_samples *batch, uint32_t begin, uint32_t end, uint32_t axis, float split)
 {
-    uint32_t level = node ? 1 : 0, levels = gkdi_look_levels(desc);
-    for (; c->look[node].child; ++level) {
-        gkd_signature *s = &c->look[node];
-        gkdi_signature_light(s, direction, value);
-        node = (uint32_t)s->child + !(position[s->axis] < s->split);
-    }
-    gkdi_signature_add(&c->look[node], position, direction, value);
-    if (level < levels && c->look_count + 2 <= c->look_capacity &&
-        gkdi_signature_count(&c->look[node]) >= (double)desc->min_samples) {
-        uint32_t axis;
-        float split;
-        if (gkdi_signature_split_axis(&c->look[node], &axis, &split)) {
-            gkd_signature *s = &c->look[node];
-            s->axis = (uint8_t)axis;
-            s->split = split;
-            s->child = (uint16_t)c->look_count;
-            memset(&c->look[c->look_count], 0, 2 * sizeof *c->look);
-            c->look_count += 2;
-        }
-    }
+    uint32_t i, low = begin, high = 0;
+    for (i = begin; i < end; ++i)
+        if (batch->items[i].position[axis] < split)
+            batch->items[low++] = batch->items[i];
+        else
+            batch->other_items[high++] = batch->items[i];
+    memcpy(batch->items + low, batch->other_items, high * sizeof *batch->items);
+    return low;
 }
 
-/* Add a range of a batch to a cell. While the cell itself may yet be divided, one by one. */
-static void gkdi_feed(const gkd_desc *desc, gkdi_cell *c, const gkdi_cell_samples *batch, const uint32_t range[4])
+static uint32_t gkdi_cut_zeros(gkdi_cell_samples *batch, uint32_t begin, uint32_t end, uint32_t axis, float split)
 {
-    static const float none[3] = {0, 0, 1};
-    bool divides = gkdi_look_levels(desc) > 0;
+    uint32_t i, low = begin, high = 0;
+    for (i = begin; i < end; ++i) { /* no branch: it could not be predicted */
+        float zero[3];
+        bool above = !(batch->zeros[i][axis] < split);
+        memcpy(zero, batch->zeros[i], sizeof zero);
+        memcpy(batch->zeros[low], zero, sizeof zero);
+        memcpy(batch->other_zeros[high], zero, sizeof zero);
+        low += !above;
+        high += above;
+    }
+    memcpy(batch->zeros + low, batch->other_zeros, high * sizeof *batch->zeros);
+    return low;
+}
+
+/* A batch on its way down a lookahead tree: items by lists of their indices, which keeps them in the order they came;
+   zeros themselves. */
+typedef struct gkdi_feeder {
+    const gkd_desc *desc;
+    gkdi_cell *cell;
+    gkdi_cell_samples *batch;
+    double from[3]; /* reference point of positions */
+} gkdi_feeder;
+
+typedef struct gkdi_portion {
+    uint32_t *list, count; /* items */
+    uint32_t begin, end;   /* zeros */
+} gkdi_portion;
+
+/* The first `most` samples of a portion, items first, become part of a lookahead cell and are taken out of it. */
+static void gkdi_look_take_in(const gkdi_feeder *f, gkd_signature *s, gkdi_portion *p, double most, gkdi_sum *sum)
+{
+    uint32_t items = (double)p->count < most ? p->count : (uint32_t)most, zeros = p->end - p->begin;
+    gkdi_sum part;
+    memset(&part, 0, sizeof part);
+    gkdi_sum_light(&part, &f->cell->shape, f->batch->items, p->list, items);
+    gkdi_sum_places(&part, f->from, f->batch->items, p->list, items);
+    most -= items;
+    zeros = (double)zeros < most ? zeros : (uint32_t)most;
+    part.samples += zeros;
+    p->list += items;
+    p->count -= items;
+    p->begin += zeros;
+    gkdi_signature_add(s, &part, f->from);
+    gkdi_sum_add(sum, &part);
+}
+
+/* Divide a lookahead cell where its samples allow it: true if it now has children. */
+static bool gkdi_look_divide(gkdi_cell *c, gkd_signature *s)
+{
+    uint32_t axis;
+    float split;
+    if (!gkdi_signature_split_axis(s, &axis, &split))
+        return false;
+    s->axis = (uint8_t)axis;
+    s->split = split;
+    s->child = (uint16_t)c->look_count;
+    memset(&c->look[c->look_count], 0, 2 * sizeof *c->look);
+    c->look_count += 2;
+    return true;
+}
+
+/* Stable partition of a portion by the plane of a lookahead cell: what lies below is left in it, the rest returned. */
+static gkdi_portion gkdi_portion_cut(const gkdi_feeder *f, const gkd_signature *s, gkdi_portion *p)
+{
+    gkdi_portion high;
+    const gkdi_item *items = f->batch->items;
+    uint32_t i, low = 0, up = 0, *other = f->batch->other_list;
+    for (i = 0; i < p->count; ++i) { /* no branch: it could not be predicted */
+        uint32_t at = p->list[i];
+        bool above = !(items[at].position[s->axis] < s->split);
+        p->list[low] = other[up] = at;
+        up += above;
+        low += !above;
+    }
+    memcpy(p->list + low, other, up * sizeof *other);
+    high.list = p->list + low;
+    high.count = up;
+    high.end = p->end;
+    high.begin = p->end = gkdi_cut_zeros(f->batch, p->begin, p->end, s->axis, s->split);
+    p->count = low;
+    return high;
+}
+
+/* Add a portion to lookahead cell `node` (0: the cell itself), which lies `level` below it, and to those below; adds up
+   what was added. Each sample is read where it ends; cells above get the sums of what is below. Where a cell without
+   children has enough samples and levels and room are left, it is divided, and later samples go on below. */
+static void gkdi_look_feed(const gkdi_feeder *f, uint32_t node, uint32_t level, gkdi_portion p, gkdi_sum *sum)
+{
+    gkdi_cell *c = f->cell;
+    gkd_signature *s = &c->look[node];
+    gkdi_portion high;
+    gkdi_sum below;
+    if (p.count == 0 && p.begin == p.end)
+        return;
+    if (!s->child) {
+        double enough = (double)f->desc->min_samples;
+        bool divides = level < gkdi_look_levels(f->desc) && c->look_count + 2 <= c->look_capacity;
+        if (divides)
+            gkdi_look_take_in(f, s, &p, fmax(ceil(enough - s->samples), 1), sum);
+        if (!divides || s->samples < enough || !gkdi_look_divide(c, s)) {
+            gkdi_look_take_in(f, s, &p, 1e10, sum);
+            return;
+        }
+    }
+    memset(&below, 0, sizeof below);
+    high = gkdi_portion_cut(f, s, &p);
+    gkdi_look_feed(f, s->child, level + 1, p, &below);
+    gkdi_look_feed(f, s->child + 1u, level + 1, high, &below);
+    gkdi_signature_add(s, &below, f->from);
+    gkdi_sum_add(sum, &below);
+}
+
+/* Add a range of a batch to a cell; zeros change their order. */
+static void gkdi_feed(const gkd_desc *desc, gkdi_cell *c, gkdi_cell_samples *batch, const uint32_t range[4])
+{
+    gkdi_feeder f;
+    gkdi_portion p;
+    gkdi_sum sum;
     uint32_t i;
-    for (i = range[0]; i < range[1] && divides && !c->look[0].child; ++i) {
-        gkdi_look_add(desc, c, 0, batch->items[i].position, batch->items[i].direction, batch->items[i].weight);
-        gkdi_shape_add(&c->shape, batch->items[i].direction, batch->items[i].weight);
-    }
-    gkdi_signature_add_all(&c->look[0], &c->shape, batch->items + i, range[1] - i);
-    for (; i < range[1] && divides; ++i) {
-        const gkd_signature *s = &c->look[0];
-        const gkdi_item *p = &batch->items[i];
-        gkdi_look_add(desc, c, (uint32_t)s->child + !(p->position[s->axis] < s->split), p->position, p->direction,
-                      p->weight);
-    }
-    for (i = range[2]; i < range[3]; ++i)
-        gkdi_look_add(desc, c, 0, batch->zeros[i], none, 0);
+    f.desc = desc;
+    f.cell = c;
+    f.batch = batch;
+    p.list = batch->list;
+    p.count = range[1] - range[0];
+    p.begin = range[2];
+    p.end = range[3];
+    for (i = 0; i < 3; ++i)
+        f.from[i] = c->look[0].lit > 0 || !p.count ? c->look[0].mean[i] : (double)batch->items[range[0]].position[i];
+    for (i = 0; i < p.count; ++i)
+        p.list[i] = range[0] + i;
+    memset(&sum, 0, sizeof sum);
+    gkdi_look_feed(&f, 0, 0, p, &sum);
     c->lit += range[1] - range[0];
 }
 
@@ -3283,31 +3400,6 @@ static void gkdi_look_take(const gkdi_cell *from, uint32_t root, gkdi_cell *to, 
         gkdi_shape_scale(&to->shape, to->look[0].squares / from->look[0].squares);
     else
         memset(&to->shape, 0, sizeof to->shape);
-}
-
-/* Stable partition of a range by a plane; the first part's end. */
-static uint32_t gkdi_cut_items(gkdi_cell_samples *batch, uint32_t begin, uint32_t end, uint32_t axis, float split)
-{
-    uint32_t i, low = begin, high = 0;
-    for (i = begin; i < end; ++i)
-        if (batch->items[i].position[axis] < split)
-            batch->items[low++] = batch->items[i];
-        else
-            batch->other_items[high++] = batch->items[i];
-    memcpy(batch->items + low, batch->other_items, high * sizeof *batch->items);
-    return low;
-}
-
-static uint32_t gkdi_cut_zeros(gkdi_cell_samples *batch, uint32_t begin, uint32_t end, uint32_t axis, float split)
-{
-    uint32_t i, low = begin, high = 0;
-    for (i = begin; i < end; ++i)
-        if (batch->zeros[i][axis] < split)
-            memcpy(batch->zeros[low++], batch->zeros[i], sizeof *batch->zeros);
-        else
-            memcpy(batch->other_zeros[high++], batch->zeros[i], sizeof *batch->zeros);
-    memcpy(batch->zeros + low, batch->other_zeros, high * sizeof *batch->zeros);
-    return low;
 }
 
 /* Room for one more cell and two more nodes. */
@@ -3626,16 +3718,19 @@ static void gkdi_update_cells(void *context, uint32_t begin, uint32_t end)
         n = u->outcomes[k].end - u->outcomes[k].first > n ? u->outcomes[k].end - u->outcomes[k].first : n;
     batch.items = (gkdi_item *)desc->allocate(desc->user, n * 2 * sizeof *batch.items);
     batch.zeros = (float(*)[3])desc->allocate(desc->user, n * 2 * sizeof *batch.zeros);
+    batch.list = (uint32_t *)desc->allocate(desc->user, n * 2 * sizeof *batch.list);
     for (k = begin; k < end; ++k) {
-        u->outcomes[k].failed = !batch.items || !batch.zeros;
+        u->outcomes[k].failed = !batch.items || !batch.zeros || !batch.list;
         if (u->outcomes[k].failed)
             continue;
         batch.other_items = batch.items + n;
         batch.other_zeros = batch.zeros + n;
+        batch.other_list = batch.list + n;
         gkdi_update_cell(u, &u->outcomes[k], &batch);
     }
     gkdi_release(desc, batch.items);
     gkdi_release(desc, batch.zeros);
+    gkdi_release(desc, batch.list);
 }
 
 static bool gkdi_finite(float x) { return x - x == 0; }

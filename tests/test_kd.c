@@ -958,6 +958,44 @@ static void test_signature_rule_splits_at_an_edge_of_light_only(void **state)
     }
 }
 
+/* With keep_signatures a half goes on with what its lookahead cell saw, which tells where its samples lie: all of them,
+   also those that came after that cell was divided, and lay elsewhere. What came before it was made it does not know.
+ */
+static void test_kept_signatures_know_where_their_samples_lie(void **state)
+{
+    (void)state;
+    enum { N = 30000, PASSES = 3 };
+    static gkd_training_sample s[PASSES * N];
+    gkd_desc d = unit_cube();
+    gkd_field *f;
+    d.keep_signatures = 0.5f;
+    seed(53);
+    OK(gkd_create(&d, &f));
+    for (int pass = 0; pass < PASSES; ++pass) {
+        plain_samples(s + pass * N, N, pass == 2);
+        for (int i = pass * N; i < pass * N + N; ++i)
+            s[i].position[1] = 0.2f * s[i].position[1] + 0.4f * (float)pass;
+        assert_int_equal(gkd_cell_count(f), 1);
+        learn(f, s + pass * N, N);
+        OK(gkd_refine(f, NULL, NULL, NULL));
+    }
+    OK(gkd_validate(f));
+    gkd_view v = gkd_get_view(f);
+    assert_in_range(v.cell_count, 2, 1000);
+    double *sum = test_calloc(v.cell_count, 4 * sizeof *sum);
+    for (int i = 0; i < PASSES * N; ++i) {
+        double *c = sum + 4 * gkd_find_cell(&v, s[i].position);
+        for (int k = 0; k < 3; ++k)
+            c[k] += (double)s[i].position[k];
+        c[3]++;
+    }
+    for (uint32_t i = 0; i < v.cell_count; ++i)
+        for (int k = 0; k < 3 && sum[4 * i + 3] > 0; ++k)
+            assert_true(fabs((double)v.cells[i].pivot[k] - sum[4 * i + (uint32_t)k] / sum[4 * i + 3]) < 0.05);
+    test_free(sum);
+    gkd_destroy(f);
+}
+
 /* ---- split reports */
 
 typedef struct replay {
@@ -1551,6 +1589,7 @@ int main(void)
         cmocka_unit_test(test_training_is_the_same_at_every_level),
         cmocka_unit_test(test_count_rule_splits_at_the_documented_number),
         cmocka_unit_test(test_signature_rule_splits_at_an_edge_of_light_only),
+        cmocka_unit_test(test_kept_signatures_know_where_their_samples_lie),
         cmocka_unit_test(test_split_reports_let_another_model_follow),
         cmocka_unit_test(test_save_and_load_go_on_training_the_same),
         cmocka_unit_test(test_truncated_and_flipped_saves_are_refused),
