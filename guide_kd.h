@@ -56,13 +56,17 @@
                    or its mean direction by more than desc.direction_step radians, with error probability
                    desc.confidence per test.
        count       when it has seen desc.split_samples non-zero samples.
+     Where both halves of a lookahead cell are like their cell with confidence (the same tests, turned round: surely
+     less than radiance_step and direction_step away), and so is all that was below, nothing is kept below it until it
+     differs or has twice the samples.
      After a split the lookahead cells of both halves start anew from the samples of the current update, and each half
      is looked at again, so that one update can split many times. Mixtures are inherited, seen from the new pivots.
 
      What is learned: radiance. Each sample counts with its largest channel over pdf_mix. An *update* happens after
      every desc.update_samples samples and in refine: signatures, splits, and a few steps of weighted EM on each
-     cell's mixture. Of all samples of a cell a quarter counts, earlier ones fade: they were drawn with worse guides.
-     What queries see changes in refine only.
+     cell's mixture. A mixture that no longer changes rests until its cell has seen twice the samples [after Zheng 2025,
+     section 7.5]: it has moved by less than 0.005 nats per share of new samples. Of all samples of a cell a quarter
+   counts, earlier ones fade: they were drawn with worse guides. What queries see changes in refine only.
 
      Parallax: each lobe knows how far away that is what it shows. gkd_find turns every lobe to the position that asks
      [Ruppert 2020]. With a normal, lobes are multiplied by the cosine, and what lies below the surface is mirrored up:
@@ -133,7 +137,7 @@
 #include <stdint.h>
 #include <string.h>
 
-#define GKD_VERSION 2 /* of the saved format */
+#define GKD_VERSION 3 /* of the saved format */
 
 #ifndef GKD_API /* linkage of the functions; e.g. static */
 #define GKD_API extern
@@ -195,6 +199,7 @@ typedef struct gkd_desc {
     float direction_step;   /* tau, angle between mean directions, radians, 0.001 .. 3.1; default 3 degrees */
     float confidence;       /* probability that a test is wrong, 1e-12 .. 0.4; default 1e-4 */
     bool no_radiance_test, no_direction_test;
+    bool no_prune;           /* keep lookahead cells also where all are surely like their cell */
     bool published_tests;    /* the formulas of [Zheng 2025] word for word, to compare with */
     float keep_signatures;   /* after a split, what lookahead cells have seen counts so many times, 0 .. 1; default 0:
                                 they start anew [Zheng 2025, sections 3.2, 7.2] */
@@ -206,6 +211,7 @@ typedef struct gkd_desc {
     float alpha;         /* start value (and fixed value) of the probability of BSDF sampling, 0.05 .. 1; default 0.5 */
     float uniform;       /* e, share of uniform sampling in the guide's density, 1e-4 .. 1; default 0.01 */
     bool no_mixtures;    /* structure only: for other directional models */
+    bool no_rest;        /* fit also mixtures that no longer change */
     bool no_gate;        /* guide in every cell */
     float gate_margin;   /* V(1) / V(a) - 1 below which guiding does not pay, 0.001 .. 10; default 0.05 */
     float gate_gain;     /* V(1) - V(a) below which guiding does not pay, 0.0001 .. 1000; default 0.25 */
@@ -261,6 +267,8 @@ typedef struct gkd_stats {
     uint64_t probed;                            /* closed cells tried again so far */
     uint64_t radiance_splits, direction_splits; /* by which test; those that both asked for count in both */
     uint64_t fits;                              /* mixtures that an update changed */
+    uint64_t rests;                             /* mixtures that had converged, so that it did not */
+    uint64_t alike;                             /* lookahead cells given up so far, since they are like their cell */
     uint64_t denied_splits;                     /* for max_bytes or max_levels; best 0 */
     uint32_t passes;                            /* calls of refine */
     uint32_t updates;
@@ -1093,6 +1101,8 @@ GKD_API void gkd_pdf_directions(const gkd_view *view, const gkd_handle *handle, 
 #define GKDI_MAX_LOOK 255         /* nodes of a cell's lookahead tree: 2^(7 + 1) - 1 */
 #define GKDI_MAX_CELLS (1u << 26)
 #define GKDI_NONE 0xffffffffu
+#define GKDI_CALM 0.005f    /* nats: a guide so far from the best costs so little that noise of pictures hides it */
+#define GKDI_CALM_FITS 2    /* in a row: one may be chance */
 #define GKDI_AHEAD 16       /* samples in the order of cells lie anywhere: so many are on their way */
 #define GKDI_GROUP 16       /* positions looked up, handles oriented together */
 #define GKDI_PACKED_COUNT 3 /* word of a packed mixture that holds the number of lobes */
@@ -1165,7 +1175,7 @@ typedef struct gkd_signature {
     float split;         /* the lookahead tree's: position[axis] < split goes to child, others to child + 1 */
     uint16_t child;      /* 0 = none */
     uint8_t axis;
-    uint8_t unused;
+    uint8_t alike; /* not 0: surely like the cell, and so is all that was below: stays without children */
 } gkd_signature;
 
 /* Sum of L^2 direction direction^T of a cell: xx yy zz xy xz yz. How noise in the mean direction is spread (own). */
@@ -1173,6 +1183,7 @@ typedef struct gkdi_shape {
     double s[6];
 } gkdi_shape;
 
+#define GKDI_ALIKE_SIGMAS 2          /* 2.3 % of those just T or tau away count as alike at a look, until the next */
 #define GKDI_LIT_MAX 16777216.0f     /* counting in f32 ends here */
 #define GKDI_VARIANCE_WINDOW 1048576 /* 1 / it is well above the rounding of f32 */
 
@@ -1566,36 +1577,41 @@ static double gkdi_least_angle(const gkdi_split_tests *t, double spread)
 
 /* ---- >>compare ---------------------------------------------------------------------------------------------- */
 
-/* Does a lookahead cell's mean radiance differ by more than T from the cell's? [Zheng 2025, Appendix A], divided by
+/* By how much a lookahead cell's mean radiance lies farther than T above (sign 1) or below (-1) the cell's, and the
+   standard error of that: does it differ? [Zheng 2025, Appendix A], divided by
    N_g; "rest" is the cell without the lookahead cell. Own: 1. A score test. Both variances are at least what they are
    if all samples have the same relative variance and the lookahead cell's mean is (1 -+ T) times the cell's, the edge
    of the null hypothesis. A lookahead cell that rare bright samples have missed so far sees neither them nor the
    variance that they make; the cell does.
    2. N_l / N_g is random too: adds (1 -+ T)^2 f (1 - f) (difference of the two means)^2 / N_g. */
-static bool gkdi_radiance_differs(const gkdi_split_tests *t, const gkd_signature *g, const gkd_signature *l)
+static double gkdi_radiance_excess(const gkdi_split_tests *t, const gkd_signature *g, const gkd_signature *l, int sign,
+                                   double *error)
 {
     double ng = g->samples, nl = l->samples, nr = ng - nl, f = nl / ng, bright = g->sum / ng;
     double r1 = g->sum > l->sum ? g->sum - l->sum : 0, r2 = g->squares > l->squares ? g->squares - l->squares : 0;
-    double ml = l->sum / nl, mr = r1 / nr, var_l = l->squares / nl - ml * ml, var_r = r2 / nr - mr * mr;
-    int sign;
-    var_l = var_l > 0 ? var_l : 0;
-    var_r = var_r > 0 ? var_r : 0;
-    for (sign = -1; sign <= 1; sign += 2) {
-        double k = 1 + sign * t->radiance_step, cr = k * (1 - f), cl = 1 - k * f, difference = sign * (ml - k * bright);
-        double vl = var_l, vr = var_r, more = 0;
-        if (!(difference > 0) || k <= 0 || (sign > 0 && cl <= 0))
-            continue;
-        if (!t->reference) {
-            double null_l = k * bright, null_r = bright * cl / (1 - f), apart = null_l - null_r, pooled;
-            pooled = f * var_l / (null_l * null_l) + (1 - f) * var_r / (null_r * null_r);
-            vl = fmax(vl, pooled * null_l * null_l);
-            vr = fmax(vr, pooled * null_r * null_r);
-            more = k * k * f * (1 - f) * apart * apart / ng;
-        }
-        if (difference > t->radiance_sigmas * sqrt(cr * cr * vr / nr + cl * cl * vl / nl + more))
-            return true;
+    double ml = l->sum / nl, mr = r1 / nr, vl = l->squares / nl - ml * ml, vr = r2 / nr - mr * mr, more = 0;
+    double k = 1 + sign * t->radiance_step, cr = k * (1 - f), cl = 1 - k * f;
+    vl = vl > 0 ? vl : 0;
+    vr = vr > 0 ? vr : 0;
+    *error = 0;
+    if (k <= 0 || (sign > 0 && cl <= 0)) /* no cell can be so dark, no part so bright */
+        return -1;
+    if (!t->reference) {
+        double null_l = k * bright, null_r = bright * cl / (1 - f), apart = null_l - null_r, pooled;
+        pooled = f * vl / (null_l * null_l) + (1 - f) * vr / (null_r * null_r);
+        vl = fmax(vl, pooled * null_l * null_l);
+        vr = fmax(vr, pooled * null_r * null_r);
+        more = k * k * f * (1 - f) * apart * apart / ng;
     }
-    return false;
+    *error = sqrt(cr * cr * vr / nr + cl * cl * vl / nl + more);
+    return sign * (ml - k * bright);
+}
+
+static bool gkdi_radiance_differs(const gkdi_split_tests *t, const gkd_signature *g, const gkd_signature *l)
+{
+    double below, above, low = gkdi_radiance_excess(t, g, l, -1, &below),
+                         high = gkdi_radiance_excess(t, g, l, 1, &above);
+    return (low > 0 && low > t->radiance_sigmas * below) || (high > 0 && high > t->radiance_sigmas * above);
 }
 
 static double gkdi_dot(const double a[3], const double b[3]) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
@@ -1674,24 +1690,16 @@ static double gkdi_reference_variance(const gkd_signature *s)
     return 1 / kappa;
 }
 
-/* Does a lookahead cell's mean direction differ by more than tau from the cell's? [Zheng 2025, 5.3]
+/* Variance of the angle between the mean directions of a lookahead cell and the cell.
    Own: the lookahead cell's samples are the cell's too. With w_g = w_delta + w_l and in-plane tangents t_g, t_l of
    either mean, the angle changes by t_g . dw_delta / |w_g| + (t_g / |w_g| - t_l / |w_l|) . dw_l to first order, where
    dw are independent: that gives the spread. */
-static bool gkdi_direction_differs(const gkdi_split_tests *t, const gkd_signature *g, const gkdi_shape *shape,
-                                   const gkd_signature *l)
+static double gkdi_direction_variance(const gkd_signature *g, const gkdi_shape *shape, const gkd_signature *l,
+                                      double lg, double ll)
 {
     gkdi_plane p;
-    double tl[3], ql[3], qr[3], wr[3], sine, variance, lg = sqrt(gkdi_dot(g->direction, g->direction));
-    double ll = sqrt(gkdi_dot(l->direction, l->direction)), cosine;
+    double tl[3], ql[3], qr[3], wr[3], sine, variance;
     uint32_t k;
-    if (!(lg > 0 && ll > 0))
-        return false;
-    cosine = gkdi_dot(g->direction, l->direction) / (lg * ll);
-    if (!t->reference && !(cosine < t->cos_step))
-        return false;
-    if (t->reference)
-        return cosine < cos(gkdi_least_angle(t, sqrt(gkdi_reference_variance(g) + gkdi_reference_variance(l))));
     p.length = lg;
     for (k = 0; k < 3; ++k) {
         p.mean[k] = g->direction[k] / lg;
@@ -1700,7 +1708,7 @@ static bool gkdi_direction_differs(const gkdi_split_tests *t, const gkd_signatur
     }
     gkdi_cross(ql, p.mean, p.normal);
     sine = sqrt(gkdi_dot(p.normal, p.normal));
-    if (!(sine > 1e-12)) { /* opposite: any plane */
+    if (!(sine > 1e-12)) { /* the same or opposite: any plane */
         double axis[3] = {0, 0, 0};
         axis[fabs(p.mean[0]) > 0.7] = 1;
         gkdi_cross(axis, p.mean, p.normal);
@@ -1718,7 +1726,48 @@ static bool gkdi_direction_differs(const gkdi_split_tests *t, const gkd_signatur
     if (g->sum > l->sum)
         variance += gkdi_part_variance(g, shape, &p, g->samples - l->samples, g->sum - l->sum,
                                        g->squares > l->squares ? g->squares - l->squares : 0, wr, qr);
-    return acos(cosine > -1 ? cosine : -1) > gkdi_least_angle(t, sqrt(variance));
+    return variance;
+}
+
+/* Does a lookahead cell's mean direction differ by more than tau from the cell's? [Zheng 2025, 5.3] */
+static bool gkdi_direction_differs(const gkdi_split_tests *t, const gkd_signature *g, const gkdi_shape *shape,
+                                   const gkd_signature *l)
+{
+    double lg = sqrt(gkdi_dot(g->direction, g->direction)), ll = sqrt(gkdi_dot(l->direction, l->direction)), cosine;
+    if (!(lg > 0 && ll > 0))
+        return false;
+    cosine = gkdi_dot(g->direction, l->direction) / (lg * ll);
+    if (t->reference)
+        return cosine < cos(gkdi_least_angle(t, sqrt(gkdi_reference_variance(g) + gkdi_reference_variance(l))));
+    return cosine < t->cos_step &&
+           acos(cosine > -1 ? cosine : -1) > gkdi_least_angle(t, sqrt(gkdi_direction_variance(g, shape, l, lg, ll)));
+}
+
+/* Is a lookahead cell surely like the cell, less than T and tau away (own)? The null hypotheses are turned round: that
+   it is T brighter, T darker, or tau away; each is rejected at GKDI_ALIKE_SIGMAS. A mean direction has two components:
+   where the true angle is tau, its estimate is hardly ever tau less some standard errors of the component along. */
+static bool gkdi_alike(const gkdi_split_tests *t, const gkd_signature *g, const gkdi_shape *shape,
+                       const gkd_signature *l, bool radiance, bool direction)
+{
+    double rest = g->samples - l->samples, error, lg, ll, cosine;
+    int sign;
+    if (!(l->samples >= t->min_samples && rest >= t->min_samples && g->sum > 0 && l->sum > 0 && g->squares > 0 &&
+          g->squares < 1e150))
+        return false;
+    for (sign = -1; sign <= 1 && radiance; sign += 2)
+        if (!(gkdi_radiance_excess(t, g, l, sign, &error) < -GKDI_ALIKE_SIGMAS * error))
+            return false;
+    if (!direction)
+        return true;
+    lg = sqrt(gkdi_dot(g->direction, g->direction));
+    ll = sqrt(gkdi_dot(l->direction, l->direction));
+    if (!(lg > 0 && ll > 0))
+        return false;
+    cosine = gkdi_dot(g->direction, l->direction) / (lg * ll);
+    if (shape && !(shape->s[0] + shape->s[1] + shape->s[2] > 0))
+        shape = NULL;
+    error = sqrt(gkdi_direction_variance(g, shape, l, lg, ll));
+    return acos(cosine < 1 ? (cosine > -1 ? cosine : -1) : 1) + GKDI_ALIKE_SIGMAS * error < t->direction_step;
 }
 
 /* What distinguishes a lookahead cell from the cell, with confidence: 1 mean radiance, 2 mean direction; 0 nothing.
@@ -3099,9 +3148,12 @@ typedef struct gkdi_cell {
     uint32_t *model;     /* packed, see gkdi_model_pack; NULL = untrained */
     gkdi_shape shape;    /* of the cell's own signature */
     double lit;          /* non-zero samples since the cell exists, and half of its parent's */
+    double wakes;        /* the mixture rests until lit is this; 0 = it does not */
     uint32_t look_count, look_capacity;
     uint32_t level;
     uint32_t model_capacity; /* words */
+    uint32_t calm;           /* fits in a row after which the mixture could rest */
+    uint32_t reserved;
 } gkdi_cell;
 
 typedef struct gkdi_split_event {
@@ -3144,7 +3196,7 @@ typedef struct gkdi_outcome {
     gkdi_cell *cells;
     gkd_node *nodes; /* links of leaves: local cells; 0 is the root */
     uint32_t *range; /* [capacity][4]: begin and end of a cell's items, then of its zeros */
-    uint64_t radiance_splits, direction_splits, denied, fits;
+    uint64_t radiance_splits, direction_splits, denied, fits, rests, alike;
     bool failed; /* no memory for its samples */
     bool grows;  /* its lookahead tree may take more memory */
 } gkdi_outcome;
@@ -3321,7 +3373,7 @@ static void gkdi_look_feed(const gkdi_feeder *f, uint32_t node, uint32_t level, 
         return;
     if (!s->child) {
         double enough = (double)f->desc->min_samples;
-        bool divides = level < gkdi_look_levels(f->desc) && c->look_count + 2 <= c->look_capacity;
+        bool divides = level < gkdi_look_levels(f->desc) && !s->alike && c->look_count + 2 <= c->look_capacity;
         if (divides)
             gkdi_look_take_in(f, s, &p, fmax(ceil(enough - s->samples), 1), sum);
         if (!divides || s->samples < enough || !gkdi_look_divide(c, s)) {
@@ -3372,6 +3424,58 @@ static uint32_t gkdi_wants_split(const gkd_field *field, const gkdi_cell *c)
     return asks;
 }
 
+/* Take lookahead cells without use out of a cell's tree. used: 1 for those that are left, whose order stays. */
+static void gkdi_look_pack(gkdi_cell *c, const unsigned char *used)
+{
+    uint16_t place[GKDI_MAX_LOOK];
+    uint32_t i, count = 0;
+    for (i = 0; i < c->look_count; ++i)
+        place[i] = (uint16_t)(used[i] ? count++ : 0);
+    for (i = 0; i < c->look_count; ++i)
+        if (used[i]) {
+            c->look[place[i]] = c->look[i];
+            c->look[place[i]].child = c->look[i].child ? place[c->look[i].child] : 0;
+        }
+    c->look_count = count;
+}
+
+/* Give up the children of lookahead cells of which both are surely like the cell, from the last level up, so that
+   nothing is given up of which the parts were not seen. Those about them stay and are asked again at every update; when
+   they differ, or have about doubled their samples (alike holds log2 of these), they grow again: light may have changed
+   in a small part of them. Returns how many were given up. */
+static uint32_t gkdi_look_prune(const gkd_field *field, gkdi_cell *c)
+{
+    const gkd_desc *desc = &field->desc;
+    unsigned char level[GKDI_MAX_LOOK], used[GKDI_MAX_LOOK];
+    uint32_t i, k, gone = 0;
+    memset(used, 1, sizeof used);
+    for (i = level[0] = 0; i < c->look_count; ++i) /* children come after their parents */
+        for (k = 0; k < 2 && c->look[i].child; ++k)
+            level[c->look[i].child + k] = (unsigned char)(level[i] + 1);
+    for (i = c->look_count; i-- > 1;) {
+        gkd_signature *s = &c->look[i], *child = &c->look[s->child];
+        uint32_t doubled = 1 + (uint32_t)ilogb(fmin(s->samples + 1, 1e70));
+        bool same;
+        if (s->child && child[0].alike && child[1].alike) {
+            used[s->child] = used[s->child + 1] = 0;
+            gone += 2;
+            s->child = 0;
+            s->alike = (uint8_t)doubled;
+        }
+        if (s->child || (!s->alike && level[i] < gkdi_look_levels(desc)))
+            continue;
+        same = gkdi_alike(&field->tests, &c->look[0], &c->shape, s, !desc->no_radiance_test, !desc->no_direction_test);
+        if (level[i] < gkdi_look_levels(desc))
+            same = same && s->alike == doubled;
+        s->alike = (uint8_t)(same ? doubled : 0);
+    }
+    if (gone) {
+        gkdi_look_pack(c, used);
+        gkdi_look_resize(desc, c, gkdi_look_room(desc, c->look_count)); /* or it stays large */
+    }
+    return gone;
+}
+
 /* Make `to` the part of `from` below node `root` of its lookahead tree. What was seen counts `keep` times: 0 leaves
    only where the tree is cut. */
 static void gkdi_look_take(const gkdi_cell *from, uint32_t root, gkdi_cell *to, double keep)
@@ -3390,6 +3494,7 @@ static void gkdi_look_take(const gkdi_cell *from, uint32_t root, gkdi_cell *to, 
         d->axis = s->axis;
         d->split = s->split;
         d->child = 0;
+        d->alike = 0; /* another cell to be like */
         if (!s->child)
             continue;
         d->child = (uint16_t)to->look_count;
@@ -3481,6 +3586,8 @@ static bool gkdi_divide(const gkd_field *field, gkdi_outcome *o, uint32_t at, ui
     old->gate.fresh /= 2;
     old->gate.flow /= 2;
     old->level++;
+    old->calm = 0;
+    old->wakes = 0;
     if (!gkdi_cell_copy(desc, old, &low))
         return false;
     if (!gkdi_cell_copy(desc, old, &high)) {
@@ -3640,26 +3747,69 @@ static bool gkdi_model_room(const gkd_desc *desc, gkdi_cell *c, uint32_t lobes)
     return true;
 }
 
+/* Kullback-Leibler divergence, in nats, of a mixture from what it was before: at most that of the weights and the mean
+   of that of pairs of lobes (log-sum inequality). Of lobes, with C = kappa / (2 pi (1 - exp(-2 kappa))) and A the mean
+   cosine, it is log(C'/C) + A' (kappa' - kappa mean' . mean) - (kappa' - kappa). Pairs are by index: infinite where
+   their number changed, large where some were split and others merged. */
+static double gkdi_divergence(const gkdi_model *before, const gkdi_model *now, const gkdi_fit_options *o)
+{
+    gkdi_mixture p, q;
+    double bound = 0;
+    uint32_t k;
+    if (before->count != now->count || !now->count)
+        return (double)INFINITY;
+    gkdi_maximise(&before->sums, before->count, o, &q);
+    gkdi_maximise(&now->sums, now->count, o, &p);
+    for (k = 0; k < now->count; ++k) {
+        const float mp[3] = {p.x[k], p.y[k], p.z[k]}, mq[3] = {q.x[k], q.y[k], q.z[k]};
+        double w = (double)p.weight[k], kp = (double)p.kappa[k], kq = (double)q.kappa[k];
+        double lobes = log(gkdi_peak(kp) / gkdi_peak(kq)) - (kp - kq) +
+                       gkdi_mean_cosine(kp) * (kp - kq + kq * 0.5 * gkdi_distance2(mp, mq));
+        bound += w > 0 ? w * (log(w / gkdi_max((double)q.weight[k], 1e-30)) + lobes) : 0;
+    }
+    return bound;
+}
+
+/* After a fit: could the mixture rest? If it moved by at most GKDI_CALM nats, over the share h of its samples that was
+   new (own). Noise: where d is how far a mixture of all samples is from the truth, a fit moves it by about h d. Change:
+   light that is D from what is known moves it by h^2 D. So d and h D are small. After GKDI_CALM_FITS of these in a row
+   it rests until the cell has seen twice the samples; if it moves then, it is awake. */
+static void gkdi_calm(gkdi_cell *c, const gkdi_model *before, const gkdi_model *now, uint32_t n,
+                      const gkdi_fit_options *o)
+{
+    double share = gkdi_min(n / gkdi_max((double)now->samples, 1), 1);
+    bool calm = gkdi_divergence(before, now, o) <= (double)GKDI_CALM * share;
+    c->calm = !calm ? 0 : c->calm < GKDI_CALM_FITS ? c->calm + 1 : c->calm;
+    c->wakes = c->calm == GKDI_CALM_FITS ? 2 * c->lit : 0;
+}
+
 /* Learn a cell's mixture from items, seen from the mean position of all that the cell has seen. False = out of memory:
    it stays as it was. */
 static bool gkdi_fit_cell(const gkd_field *field, gkdi_outcome *o, gkdi_cell *c, const gkdi_item *items, uint32_t n)
 {
     const gkd_desc *desc = &field->desc;
-    gkdi_model model;
+    gkdi_model model, before;
     float pivot[3];
     if (n == 0 || desc->no_mixtures)
         return true;
+    if (c->lit < c->wakes) {
+        o->rests++;
+        return true;
+    }
     gkdi_signature_mean(&c->look[0], pivot);
     if (c->model) {
         gkdi_model_unpack(&model, c->model);
         gkdi_model_move(&model, pivot, &field->fit);
     } else
         gkdi_model_init(&model, pivot);
+    before = model;
     gkdi_model_fit(&model, items, n, &field->fit);
     if (!gkdi_model_room(desc, c, model.count))
         return false;
     gkdi_model_pack(&model, c->model);
     o->fits++;
+    if (!desc->no_rest)
+        gkdi_calm(c, &before, &model, n, &field->fit);
     return true;
 }
 
@@ -3703,7 +3853,8 @@ static void gkdi_update_cell(const gkdi_update *u, gkdi_outcome *o, gkdi_cell_sa
             return;
         gkdi_outcome_free(desc, o);
         o->denied++;
-    }
+    } else if (desc->split == GKD_SPLIT_SIGNATURE && !desc->no_prune)
+        o->alike += gkdi_look_prune(field, c);
     gkdi_fit_cell(field, o, c, batch->items, range[1]);
 }
 
@@ -3955,6 +4106,8 @@ static void gkdi_update_commit(gkdi_update *u, const uint32_t *leaves)
         field->stats.direction_splits += o->direction_splits;
         field->stats.denied_splits += o->denied;
         field->stats.fits += o->fits;
+        field->stats.rests += o->rests;
+        field->stats.alike += o->alike;
         if (o->failed) {
             field->stats.samples -= o->end - o->first;
             field->stats.lost += o->end - o->first;
@@ -5540,8 +5693,8 @@ typedef struct gkdi_header {
 typedef struct gkdi_saved_cell {
     gkdi_gate gate;
     gkdi_shape shape;
-    double lit;
-    uint32_t look_count, model_words, level, reserved;
+    double lit, wakes;
+    uint32_t look_count, model_words, level, calm;
 } gkdi_saved_cell;
 
 static const char gkdi_magic[8] = {'g', 'u', 'i', 'd', 'e', '_', 'k', 'd'};
@@ -5568,7 +5721,8 @@ static gkdi_options gkdi_options_of(const gkd_desc *d)
     o.lookahead = d->lookahead;
     o.min_samples = d->min_samples;
     o.flags = (d->no_radiance_test ? 1u : 0) | (d->no_direction_test ? 2u : 0) | (d->keep_signatures ? 4u : 0) |
-              (d->no_mixtures ? 8u : 0) | (d->no_gate ? 16u : 0) | (d->published_tests ? 32u : 0);
+              (d->no_mixtures ? 8u : 0) | (d->no_gate ? 16u : 0) | (d->published_tests ? 32u : 0) |
+              (d->no_prune ? 64u : 0) | (d->no_rest ? 128u : 0);
     o.max_levels = d->max_levels;
     o.max_lobes = d->max_lobes;
     o.update_samples = d->update_samples;
@@ -5600,6 +5754,8 @@ static void gkdi_options_to(const gkdi_options *o, gkd_desc *d)
     d->no_mixtures = (o->flags & 8u) != 0;
     d->no_gate = (o->flags & 16u) != 0;
     d->published_tests = (o->flags & 32u) != 0;
+    d->no_prune = (o->flags & 64u) != 0;
+    d->no_rest = (o->flags & 128u) != 0;
     d->max_levels = o->max_levels;
     d->max_lobes = o->max_lobes;
     d->update_samples = o->update_samples;
@@ -5685,6 +5841,8 @@ GKD_API gkd_result gkd_save(const gkd_field *field, void *data, size_t capacity,
         s.gate = c->gate;
         s.shape = c->shape;
         s.lit = c->lit;
+        s.wakes = c->wakes;
+        s.calm = c->calm;
         s.look_count = c->look_count;
         s.model_words = c->model_capacity;
         s.level = c->level;
@@ -5856,7 +6014,8 @@ GKD_API gkd_result gkd_validate(const gkd_field *field)
     for (i = 0; ok && i < field->cell_count; ++i) {
         const gkdi_cell *c = &field->cells[i];
         ok = gkdi_look_valid(c, most) && gkdi_gate_valid(&c->gate) && c->lit >= 0 && c->lit < INFINITY &&
-             c->level <= 60 && (!c->model || gkdi_model_valid(c->model, c->model_capacity));
+             c->wakes >= 0 && c->wakes < INFINITY && c->calm <= GKDI_CALM_FITS && c->level <= 60 &&
+             (!c->model || gkdi_model_valid(c->model, c->model_capacity));
     }
     for (i = 0; ok && i < field->split_count; ++i)
         ok = field->splits[i].parent < field->cell_count && field->splits[i].child < field->cell_count;
@@ -5883,6 +6042,8 @@ static gkd_result gkdi_load_parts(gkd_field *f, const gkdi_header *h, gkdi_reade
         c->gate = saved[i].gate;
         c->shape = saved[i].shape;
         c->lit = saved[i].lit;
+        c->wakes = saved[i].wakes;
+        c->calm = saved[i].calm;
         c->level = saved[i].level;
         c->look = (gkd_signature *)gkdi_read(r, d, saved[i].look_count, sizeof *c->look);
         c->look_count = c->look_capacity = saved[i].look_count;

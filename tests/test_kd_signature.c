@@ -283,6 +283,60 @@ static void test_sums(void)
     }
 }
 
+/* A pool of samples over and over, in batches of different length: 1e7 of them, with GUIDE_TEST_LONG set 1e9. Truth is
+   the pool's sums in extended precision, times how often it came. */
+static void test_drift(void)
+{
+    enum { N = 1 << 14 };
+    static gkdi_item items[N];
+    static uint32_t list[N];
+    const uint32_t turns = getenv("GUIDE_TEST_LONG") ? 61036 : 611;
+    const double from[3] = {1e4, 1e4, 1e4};
+    long double sum = 0, squares = 0, direction = 0, mean = 0, spread = 0;
+    gkd_signature s;
+    gkdi_shape shape;
+    double start = seconds(), worst;
+    uint32_t i, k, turn_number;
+    memset(&s, 0, sizeof s);
+    memset(&shape, 0, sizeof shape);
+    for (i = 0; i < N; ++i) {
+        double d[3];
+        draw_vmf(3, d);
+        list[i] = i;
+        for (k = 0; k < 3; ++k) {
+            items[i].direction[k] = (float)d[k];
+            items[i].position[k] = (float)(1e4 + uniform());
+        }
+        items[i].weight = (float)exp(2 * normal());
+        sum += (long double)items[i].weight;
+        squares += (long double)items[i].weight * (long double)items[i].weight;
+        direction += (long double)items[i].weight * (long double)items[i].direction[2];
+        mean += (long double)items[i].position[0] / N;
+    }
+    for (i = 0; i < N; ++i)
+        spread += ((long double)items[i].position[0] - mean) * ((long double)items[i].position[0] - mean) / N;
+    for (turn_number = 0; turn_number < turns; ++turn_number)
+        for (i = 0; i < N; i += k) {
+            gkdi_sum part;
+            k = 1 + draw() % 4096;
+            k = k < N - i ? k : N - i;
+            memset(&part, 0, sizeof part);
+            gkdi_sum_light(&part, &shape, items, list + i, k);
+            gkdi_sum_places(&part, from, items, list + i, k);
+            gkdi_signature_add(&s, &part, from);
+        }
+    worst = fmax(fabs((double)(s.sum / (sum * turns) - 1)), fabs((double)(s.squares / (squares * turns) - 1)));
+    worst = fmax(worst, fabs((double)(s.direction[2] / (direction * turns) - 1)));
+    worst = fmax(worst, fabs((double)((shape.s[0] + shape.s[1] + shape.s[2]) / (squares * turns) - 1)) - 1e-7);
+    say("drift: %g samples in %.2f s, sums %.2g off, mean %.2g, variance %.2g\n", s.samples, seconds() - start, worst,
+        (double)(s.mean[0] - mean), (double)((long double)s.variance[0] / spread - 1));
+    CHECK(s.samples == (double)N * turns, "samples %.17g", s.samples);
+    CHECK(worst < 1e-12, "sums %g off", worst);
+    CHECK(fabs((double)(s.mean[0] - mean)) < 1e-4, "mean %g off", (double)(s.mean[0] - mean));
+    CHECK(fabs((double)((long double)s.variance[0] / spread - 1)) < 1e-3, "variance %g", (double)s.variance[0]);
+    CHECK(gkdi_signature_valid(&s), "valid");
+}
+
 static void test_split_axis(void)
 {
     static const float base[] = {0, 1, -1, 1e6f, -1e6f, 1e30f, 1e-40f, 0.1f};
@@ -1241,6 +1295,7 @@ static void sums_do_not_drift(void **state)
     failures = 0;
     rng = 3;
     test_sums();
+    test_drift();
     assert_int_equal(failures, 0);
 }
 
