@@ -56,13 +56,17 @@
                    or its mean direction by more than desc.direction_step radians, with error probability
                    desc.confidence per test.
        count       when it has seen desc.split_samples non-zero samples.
+     Where both halves of a lookahead cell are like their cell with confidence (the same tests, turned round: surely
+     less than radiance_step and direction_step away), and so is all that was below, nothing is kept below it until it
+     differs or has twice the samples.
      After a split the lookahead cells of both halves start anew from the samples of the current update, and each half
      is looked at again, so that one update can split many times. Mixtures are inherited, seen from the new pivots.
 
      What is learned: radiance. Each sample counts with its largest channel over pdf_mix. An *update* happens after
      every desc.update_samples samples and in refine: signatures, splits, and a few steps of weighted EM on each
-     cell's mixture. Of all samples of a cell a quarter counts, earlier ones fade: they were drawn with worse guides.
-     What queries see changes in refine only.
+     cell's mixture. A mixture that no longer changes rests until its cell has seen twice the samples [after Zheng 2025,
+     section 7.5]: it has moved by less than 0.005 nats per share of new samples. Of all samples of a cell a quarter
+   counts, earlier ones fade: they were drawn with worse guides. What queries see changes in refine only.
 
      Parallax: each lobe knows how far away that is what it shows. gkd_find turns every lobe to the position that asks
      [Ruppert 2020]. With a normal, lobes are multiplied by the cosine, and what lies below the surface is mirrored up:
@@ -133,7 +137,7 @@
 #include <stdint.h>
 #include <string.h>
 
-#define GKD_VERSION 2 /* of the saved format */
+#define GKD_VERSION 3 /* of the saved format */
 
 #ifndef GKD_API /* linkage of the functions; e.g. static */
 #define GKD_API extern
@@ -195,6 +199,7 @@ typedef struct gkd_desc {
     float direction_step;   /* tau, angle between mean directions, radians, 0.001 .. 3.1; default 3 degrees */
     float confidence;       /* probability that a test is wrong, 1e-12 .. 0.4; default 1e-4 */
     bool no_radiance_test, no_direction_test;
+    bool no_prune;           /* keep lookahead cells also where all are surely like their cell */
     bool published_tests;    /* the formulas of [Zheng 2025] word for word, to compare with */
     float keep_signatures;   /* after a split, what lookahead cells have seen counts so many times, 0 .. 1; default 0:
                                 they start anew [Zheng 2025, sections 3.2, 7.2] */
@@ -206,6 +211,7 @@ typedef struct gkd_desc {
     float alpha;         /* start value (and fixed value) of the probability of BSDF sampling, 0.05 .. 1; default 0.5 */
     float uniform;       /* e, share of uniform sampling in the guide's density, 1e-4 .. 1; default 0.01 */
     bool no_mixtures;    /* structure only: for other directional models */
+    bool no_rest;        /* fit also mixtures that no longer change */
     bool no_gate;        /* guide in every cell */
     float gate_margin;   /* V(1) / V(a) - 1 below which guiding does not pay, 0.001 .. 10; default 0.05 */
     float gate_gain;     /* V(1) - V(a) below which guiding does not pay, 0.0001 .. 1000; default 0.25 */
@@ -261,6 +267,8 @@ typedef struct gkd_stats {
     uint64_t probed;                            /* closed cells tried again so far */
     uint64_t radiance_splits, direction_splits; /* by which test; those that both asked for count in both */
     uint64_t fits;                              /* mixtures that an update changed */
+    uint64_t rests;                             /* mixtures that had converged, so that it did not */
+    uint64_t alike;                             /* lookahead cells given up so far, since they are like their cell */
     uint64_t denied_splits;                     /* for max_bytes or max_levels; best 0 */
     uint32_t passes;                            /* calls of refine */
     uint32_t updates;
@@ -1093,6 +1101,8 @@ GKD_API void gkd_pdf_directions(const gkd_view *view, const gkd_handle *handle, 
 #define GKDI_MAX_LOOK 255         /* nodes of a cell's lookahead tree: 2^(7 + 1) - 1 */
 #define GKDI_MAX_CELLS (1u << 26)
 #define GKDI_NONE 0xffffffffu
+#define GKDI_CALM 0.005f    /* nats: a guide so far from the best costs so little that noise of pictures hides it */
+#define GKDI_CALM_FITS 2    /* in a row: one may be chance */
 #define GKDI_AHEAD 16       /* samples in the order of cells lie anywhere: so many are on their way */
 #define GKDI_GROUP 16       /* positions looked up, handles oriented together */
 #define GKDI_PACKED_COUNT 3 /* word of a packed mixture that holds the number of lobes */
@@ -1165,7 +1175,7 @@ typedef struct gkd_signature {
     float split;         /* the lookahead tree's: position[axis] < split goes to child, others to child + 1 */
     uint16_t child;      /* 0 = none */
     uint8_t axis;
-    uint8_t unused;
+    uint8_t alike; /* not 0: surely like the cell, and so is all that was below: stays without children */
 } gkd_signature;
 
 /* Sum of L^2 direction direction^T of a cell: xx yy zz xy xz yz. How noise in the mean direction is spread (own). */
@@ -1173,90 +1183,108 @@ typedef struct gkdi_shape {
     double s[6];
 } gkdi_shape;
 
+#define GKDI_ALIKE_SIGMAS 2          /* 2.3 % of those just T or tau away count as alike at a look, until the next */
 #define GKDI_LIT_MAX 16777216.0f     /* counting in f32 ends here */
 #define GKDI_VARIANCE_WINDOW 1048576 /* 1 / it is well above the rounding of f32 */
 
 /* x >= 0 as f32, at most 3e38. */
 static float gkdi_float_of(double x) { return x < 3e38 ? (float)x : 3e38f; }
+static float gkdi_lit_of(double x) { return x < (double)GKDI_LIT_MAX ? (float)x : GKDI_LIT_MAX; }
 
-/* Light of one sample: all but its position. value = L >= 0, finite; of zeros, direction is not read. */
-static void gkdi_signature_light(gkd_signature *s, const float *direction, float value)
-{
-    double v = (double)value;
-    uint32_t k;
-    s->samples += 1;
-    if (!(value > 0))
-        return;
-    s->sum += v;
-    s->squares += v * v;
-    for (k = 0; k < 3; ++k)
-        s->direction[k] += v * (double)direction[k];
-}
+/* Sums of a batch, before they become part of signatures: of a lookahead cell and of the cells about it. */
+typedef struct gkdi_sum {
+    double samples, sum, squares, direction[3]; /* as in gkd_signature */
+    double lit, away[3], square[3];             /* non-zero samples, their positions from a reference point */
+} gkdi_sum;
 
-/* One sample; of zeros, the position is not read. */
-static void gkdi_signature_add(gkd_signature *s, const float position[3], const float *direction, float value)
+/* Add the light of items[list[0 .. count - 1]], all of them non-zero. */
+static void gkdi_sum_light(gkdi_sum *sum, gkdi_shape *shape, const gkdi_item *items, const uint32_t *list,
+                           uint32_t count)
 {
-    double n, gain, window;
-    uint32_t k;
-    gkdi_signature_light(s, direction, value);
-    if (!(value > 0))
-        return;
-    if (s->lit < GKDI_LIT_MAX)
-        s->lit += 1;
-    n = (double)s->lit;
-    gain = 1 / n;
-    window = n < GKDI_VARIANCE_WINDOW ? gain : 1.0 / GKDI_VARIANCE_WINDOW;
-    for (k = 0; k < 3; ++k) {
-        double away = (double)position[k] - s->mean[k], spread = (double)s->variance[k];
-        s->mean[k] += away * gain;
-        spread += (away * ((double)position[k] - s->mean[k]) - spread) * window;
-        s->variance[k] = gkdi_float_of(spread);
-    }
-}
-
-/* Of the cell itself only, not of its lookahead cells. */
-static void gkdi_shape_add(gkdi_shape *s, const float direction[3], float value)
-{
-    double v = (double)value, x = (double)direction[0] * v, y = (double)direction[1] * v, z = (double)direction[2] * v;
-    s->s[0] += x * x;
-    s->s[1] += y * y;
-    s->s[2] += z * z;
-    s->s[3] += x * y;
-    s->s[4] += x * z;
-    s->s[5] += y * z;
-}
-
-/* Many non-zero samples, in registers; positions count as if they had come one by one, but
-   for the window of their variance. */
-static void gkdi_signature_add_all(gkd_signature *s, gkdi_shape *shape, const gkdi_item *items, uint32_t count)
-{
-    gkd_signature t = *s;
-    gkdi_shape h = *shape;
-    double far[3] = {0, 0, 0}, square[3] = {0, 0, 0}, from[3], m = (double)count, old = (double)t.lit, n;
+    double light[5] = {0, 0, 0, 0, 0}, s[6] = {0, 0, 0, 0, 0, 0};
     uint32_t i, k;
-    if (!count)
-        return;
-    for (k = 0; k < 3; ++k)
-        from[k] = t.lit > 0 ? t.mean[k] : (double)items[0].position[k];
     for (i = 0; i < count; ++i) {
-        gkdi_signature_light(&t, items[i].direction, items[i].weight);
-        gkdi_shape_add(&h, items[i].direction, items[i].weight);
+        const gkdi_item *p = &items[list[i]];
+        double v = (double)p->weight, x = (double)p->direction[0] * v, y = (double)p->direction[1] * v;
+        double z = (double)p->direction[2] * v;
+        light[0] += v;
+        light[1] += v * v;
+        light[2] += x;
+        light[3] += y;
+        light[4] += z;
+        s[0] += x * x;
+        s[1] += y * y;
+        s[2] += z * z;
+        s[3] += x * y;
+        s[4] += x * z;
+        s[5] += y * z;
+    }
+    sum->samples += count;
+    sum->sum += light[0];
+    sum->squares += light[1];
+    for (k = 0; k < 3; ++k)
+        sum->direction[k] += light[2 + k];
+    for (k = 0; k < 6; ++k)
+        shape->s[k] += s[k];
+}
+
+/* Add their positions, as seen from a reference point. Loops of their own: sums stay in registers. */
+static void gkdi_sum_places(gkdi_sum *sum, const double from[3], const gkdi_item *items, const uint32_t *list,
+                            uint32_t count)
+{
+    double away[3] = {0, 0, 0}, square[3] = {0, 0, 0};
+    uint32_t i, k;
+    for (i = 0; i < count; ++i) {
+        const float *p = items[list[i]].position;
         for (k = 0; k < 3; ++k) {
-            double away = (double)items[i].position[k] - from[k];
-            far[k] += away;
-            square[k] += away * away;
+            double x = (double)p[k] - from[k];
+            away[k] += x;
+            square[k] += x * x;
         }
     }
-    t.lit = gkd_least(t.lit + (float)count, GKDI_LIT_MAX);
-    n = fmin(old, GKDI_VARIANCE_WINDOW) + m;
+    sum->lit += count;
     for (k = 0; k < 3; ++k) {
-        double mean = far[k] / m, spread = square[k] - far[k] * mean;
-        t.mean[k] = from[k] + far[k] / fmax((double)t.lit, m);
-        spread = (spread > 0 ? spread : 0) + (n - m) * ((double)t.variance[k] + mean * mean * m / n);
-        t.variance[k] = gkdi_float_of(spread / n);
+        sum->away[k] += away[k];
+        sum->square[k] += square[k];
     }
-    *s = t;
-    *shape = h;
+}
+
+static void gkdi_sum_add(gkdi_sum *sum, const gkdi_sum *other)
+{
+    uint32_t k;
+    sum->samples += other->samples;
+    sum->sum += other->sum;
+    sum->squares += other->squares;
+    sum->lit += other->lit;
+    for (k = 0; k < 3; ++k) {
+        sum->direction[k] += other->direction[k];
+        sum->away[k] += other->away[k];
+        sum->square[k] += other->square[k];
+    }
+}
+
+/* Make a batch part of a signature. Positions count as if they had come one by one, but for the window of their
+   variance. */
+static void gkdi_signature_add(gkd_signature *s, const gkdi_sum *b, const double from[3])
+{
+    double old = fmin((double)s->lit, GKDI_VARIANCE_WINDOW), m = b->lit, n = old + m;
+    bool first = !(s->lit > 0);
+    uint32_t k;
+    s->samples += b->samples;
+    s->sum += b->sum;
+    s->squares += b->squares;
+    for (k = 0; k < 3; ++k)
+        s->direction[k] += b->direction[k];
+    if (!(m > 0))
+        return;
+    s->lit = gkdi_lit_of((double)s->lit + m);
+    for (k = 0; k < 3; ++k) {
+        double mean = b->away[k] / m, spread = b->square[k] - b->away[k] * mean;
+        double move = from[k] + mean - (first ? 0 : s->mean[k]);
+        spread = (spread > 0 ? spread : 0) + (first ? 0 : old * ((double)s->variance[k] + move * move * m / n));
+        s->mean[k] = first ? move : s->mean[k] + move * m / fmax((double)s->lit, m);
+        s->variance[k] = gkdi_float_of(spread / n);
+    }
 }
 
 /* Let what was seen so far count for `factor` of its samples [Zheng 2025, section 7.2]. All signatures that are
@@ -1278,8 +1306,6 @@ static void gkdi_shape_scale(gkdi_shape *s, double factor)
     for (k = 0; k < 6; ++k)
         s->s[k] *= factor;
 }
-
-static double gkdi_signature_count(const gkd_signature *s) { return s->samples; }
 
 /* Mean position of the non-zero samples. */
 static void gkdi_signature_mean(const gkd_signature *s, float mean[3])
@@ -1551,36 +1577,41 @@ static double gkdi_least_angle(const gkdi_split_tests *t, double spread)
 
 /* ---- >>compare ---------------------------------------------------------------------------------------------- */
 
-/* Does a lookahead cell's mean radiance differ by more than T from the cell's? [Zheng 2025, Appendix A], divided by
+/* By how much a lookahead cell's mean radiance lies farther than T above (sign 1) or below (-1) the cell's, and the
+   standard error of that: does it differ? [Zheng 2025, Appendix A], divided by
    N_g; "rest" is the cell without the lookahead cell. Own: 1. A score test. Both variances are at least what they are
    if all samples have the same relative variance and the lookahead cell's mean is (1 -+ T) times the cell's, the edge
    of the null hypothesis. A lookahead cell that rare bright samples have missed so far sees neither them nor the
    variance that they make; the cell does.
    2. N_l / N_g is random too: adds (1 -+ T)^2 f (1 - f) (difference of the two means)^2 / N_g. */
-static bool gkdi_radiance_differs(const gkdi_split_tests *t, const gkd_signature *g, const gkd_signature *l)
+static double gkdi_radiance_excess(const gkdi_split_tests *t, const gkd_signature *g, const gkd_signature *l, int sign,
+                                   double *error)
 {
     double ng = g->samples, nl = l->samples, nr = ng - nl, f = nl / ng, bright = g->sum / ng;
     double r1 = g->sum > l->sum ? g->sum - l->sum : 0, r2 = g->squares > l->squares ? g->squares - l->squares : 0;
-    double ml = l->sum / nl, mr = r1 / nr, var_l = l->squares / nl - ml * ml, var_r = r2 / nr - mr * mr;
-    int sign;
-    var_l = var_l > 0 ? var_l : 0;
-    var_r = var_r > 0 ? var_r : 0;
-    for (sign = -1; sign <= 1; sign += 2) {
-        double k = 1 + sign * t->radiance_step, cr = k * (1 - f), cl = 1 - k * f, difference = sign * (ml - k * bright);
-        double vl = var_l, vr = var_r, more = 0;
-        if (!(difference > 0) || k <= 0 || (sign > 0 && cl <= 0))
-            continue;
-        if (!t->reference) {
-            double null_l = k * bright, null_r = bright * cl / (1 - f), apart = null_l - null_r, pooled;
-            pooled = f * var_l / (null_l * null_l) + (1 - f) * var_r / (null_r * null_r);
-            vl = fmax(vl, pooled * null_l * null_l);
-            vr = fmax(vr, pooled * null_r * null_r);
-            more = k * k * f * (1 - f) * apart * apart / ng;
-        }
-        if (difference > t->radiance_sigmas * sqrt(cr * cr * vr / nr + cl * cl * vl / nl + more))
-            return true;
+    double ml = l->sum / nl, mr = r1 / nr, vl = l->squares / nl - ml * ml, vr = r2 / nr - mr * mr, more = 0;
+    double k = 1 + sign * t->radiance_step, cr = k * (1 - f), cl = 1 - k * f;
+    vl = vl > 0 ? vl : 0;
+    vr = vr > 0 ? vr : 0;
+    *error = 0;
+    if (k <= 0 || (sign > 0 && cl <= 0)) /* no cell can be so dark, no part so bright */
+        return -1;
+    if (!t->reference) {
+        double null_l = k * bright, null_r = bright * cl / (1 - f), apart = null_l - null_r, pooled;
+        pooled = f * vl / (null_l * null_l) + (1 - f) * vr / (null_r * null_r);
+        vl = fmax(vl, pooled * null_l * null_l);
+        vr = fmax(vr, pooled * null_r * null_r);
+        more = k * k * f * (1 - f) * apart * apart / ng;
     }
-    return false;
+    *error = sqrt(cr * cr * vr / nr + cl * cl * vl / nl + more);
+    return sign * (ml - k * bright);
+}
+
+static bool gkdi_radiance_differs(const gkdi_split_tests *t, const gkd_signature *g, const gkd_signature *l)
+{
+    double below, above, low = gkdi_radiance_excess(t, g, l, -1, &below),
+                         high = gkdi_radiance_excess(t, g, l, 1, &above);
+    return (low > 0 && low > t->radiance_sigmas * below) || (high > 0 && high > t->radiance_sigmas * above);
 }
 
 static double gkdi_dot(const double a[3], const double b[3]) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
@@ -1659,24 +1690,16 @@ static double gkdi_reference_variance(const gkd_signature *s)
     return 1 / kappa;
 }
 
-/* Does a lookahead cell's mean direction differ by more than tau from the cell's? [Zheng 2025, 5.3]
+/* Variance of the angle between the mean directions of a lookahead cell and the cell.
    Own: the lookahead cell's samples are the cell's too. With w_g = w_delta + w_l and in-plane tangents t_g, t_l of
    either mean, the angle changes by t_g . dw_delta / |w_g| + (t_g / |w_g| - t_l / |w_l|) . dw_l to first order, where
    dw are independent: that gives the spread. */
-static bool gkdi_direction_differs(const gkdi_split_tests *t, const gkd_signature *g, const gkdi_shape *shape,
-                                   const gkd_signature *l)
+static double gkdi_direction_variance(const gkd_signature *g, const gkdi_shape *shape, const gkd_signature *l,
+                                      double lg, double ll)
 {
     gkdi_plane p;
-    double tl[3], ql[3], qr[3], wr[3], sine, variance, lg = sqrt(gkdi_dot(g->direction, g->direction));
-    double ll = sqrt(gkdi_dot(l->direction, l->direction)), cosine;
+    double tl[3], ql[3], qr[3], wr[3], sine, variance;
     uint32_t k;
-    if (!(lg > 0 && ll > 0))
-        return false;
-    cosine = gkdi_dot(g->direction, l->direction) / (lg * ll);
-    if (!t->reference && !(cosine < t->cos_step))
-        return false;
-    if (t->reference)
-        return cosine < cos(gkdi_least_angle(t, sqrt(gkdi_reference_variance(g) + gkdi_reference_variance(l))));
     p.length = lg;
     for (k = 0; k < 3; ++k) {
         p.mean[k] = g->direction[k] / lg;
@@ -1685,7 +1708,7 @@ static bool gkdi_direction_differs(const gkdi_split_tests *t, const gkd_signatur
     }
     gkdi_cross(ql, p.mean, p.normal);
     sine = sqrt(gkdi_dot(p.normal, p.normal));
-    if (!(sine > 1e-12)) { /* opposite: any plane */
+    if (!(sine > 1e-12)) { /* the same or opposite: any plane */
         double axis[3] = {0, 0, 0};
         axis[fabs(p.mean[0]) > 0.7] = 1;
         gkdi_cross(axis, p.mean, p.normal);
@@ -1703,7 +1726,48 @@ static bool gkdi_direction_differs(const gkdi_split_tests *t, const gkd_signatur
     if (g->sum > l->sum)
         variance += gkdi_part_variance(g, shape, &p, g->samples - l->samples, g->sum - l->sum,
                                        g->squares > l->squares ? g->squares - l->squares : 0, wr, qr);
-    return acos(cosine > -1 ? cosine : -1) > gkdi_least_angle(t, sqrt(variance));
+    return variance;
+}
+
+/* Does a lookahead cell's mean direction differ by more than tau from the cell's? [Zheng 2025, 5.3] */
+static bool gkdi_direction_differs(const gkdi_split_tests *t, const gkd_signature *g, const gkdi_shape *shape,
+                                   const gkd_signature *l)
+{
+    double lg = sqrt(gkdi_dot(g->direction, g->direction)), ll = sqrt(gkdi_dot(l->direction, l->direction)), cosine;
+    if (!(lg > 0 && ll > 0))
+        return false;
+    cosine = gkdi_dot(g->direction, l->direction) / (lg * ll);
+    if (t->reference)
+        return cosine < cos(gkdi_least_angle(t, sqrt(gkdi_reference_variance(g) + gkdi_reference_variance(l))));
+    return cosine < t->cos_step &&
+           acos(cosine > -1 ? cosine : -1) > gkdi_least_angle(t, sqrt(gkdi_direction_variance(g, shape, l, lg, ll)));
+}
+
+/* Is a lookahead cell surely like the cell, less than T and tau away (own)? The null hypotheses are turned round: that
+   it is T brighter, T darker, or tau away; each is rejected at GKDI_ALIKE_SIGMAS. A mean direction has two components:
+   where the true angle is tau, its estimate is hardly ever tau less some standard errors of the component along. */
+static bool gkdi_alike(const gkdi_split_tests *t, const gkd_signature *g, const gkdi_shape *shape,
+                       const gkd_signature *l, bool radiance, bool direction)
+{
+    double rest = g->samples - l->samples, error, lg, ll, cosine;
+    int sign;
+    if (!(l->samples >= t->min_samples && rest >= t->min_samples && g->sum > 0 && l->sum > 0 && g->squares > 0 &&
+          g->squares < 1e150))
+        return false;
+    for (sign = -1; sign <= 1 && radiance; sign += 2)
+        if (!(gkdi_radiance_excess(t, g, l, sign, &error) < -GKDI_ALIKE_SIGMAS * error))
+            return false;
+    if (!direction)
+        return true;
+    lg = sqrt(gkdi_dot(g->direction, g->direction));
+    ll = sqrt(gkdi_dot(l->direction, l->direction));
+    if (!(lg > 0 && ll > 0))
+        return false;
+    cosine = gkdi_dot(g->direction, l->direction) / (lg * ll);
+    if (shape && !(shape->s[0] + shape->s[1] + shape->s[2] > 0))
+        shape = NULL;
+    error = sqrt(gkdi_direction_variance(g, shape, l, lg, ll));
+    return acos(cosine < 1 ? (cosine > -1 ? cosine : -1) : 1) + GKDI_ALIKE_SIGMAS * error < t->direction_step;
 }
 
 /* What distinguishes a lookahead cell from the cell, with confidence: 1 mean radiance, 2 mean direction; 0 nothing.
@@ -3084,9 +3148,12 @@ typedef struct gkdi_cell {
     uint32_t *model;     /* packed, see gkdi_model_pack; NULL = untrained */
     gkdi_shape shape;    /* of the cell's own signature */
     double lit;          /* non-zero samples since the cell exists, and half of its parent's */
+    double wakes;        /* the mixture rests until lit is this; 0 = it does not */
     uint32_t look_count, look_capacity;
     uint32_t level;
     uint32_t model_capacity; /* words */
+    uint32_t calm;           /* fits in a row after which the mixture could rest */
+    uint32_t reserved;
 } gkdi_cell;
 
 typedef struct gkdi_split_event {
@@ -3129,7 +3196,7 @@ typedef struct gkdi_outcome {
     gkdi_cell *cells;
     gkd_node *nodes; /* links of leaves: local cells; 0 is the root */
     uint32_t *range; /* [capacity][4]: begin and end of a cell's items, then of its zeros */
-    uint64_t radiance_splits, direction_splits, denied, fits;
+    uint64_t radiance_splits, direction_splits, denied, fits, rests, alike;
     bool failed; /* no memory for its samples */
     bool grows;  /* its lookahead tree may take more memory */
 } gkdi_outcome;
@@ -3145,10 +3212,12 @@ typedef struct gkdi_update {
     uint32_t outcome_count;
 } gkdi_update;
 
-/* The samples of one cell: items are non-zero, zeros only have a position. Two arrays each, for stable partitions. */
+/* The samples of one cell: items are non-zero, zeros only have a position. Two arrays of each, and of lists of items,
+   for stable partitions. */
 typedef struct gkdi_cell_samples {
     gkdi_item *items, *other_items;
     float (*zeros)[3], (*other_zeros)[3];
+    uint32_t *list, *other_list; /* of items */
 } gkdi_cell_samples;
 
 static uint64_t gkdi_cell_bytes(const gkdi_cell *c)
@@ -3193,53 +3262,153 @@ static uint32_t gkdi_look_room(const gkd_desc *desc, uint32_t count)
     return n < most ? n : most;
 }
 
-/* Add one sample to a lookahead cell, or the cell itself, and those below in which it lies. Where the last of them has
-   enough samples and levels and room are left, it is divided: later samples go on below, and where positions lie counts
-   there only. */
-static void gkdi_look_add(const gkd_desc *desc, gkdi_cell *c, uint32_t node, const float position[3],
-                          const float *direction, float value)
+/* Stable partition of a range by a plane; the first part's end. */
+static uint32_t gkdi_cut_items(gkdi_cell_samples *batch, uint32_t begin, uint32_t end, uint32_t axis, float split)
 {
-    uint32_t level = node ? 1 : 0, levels = gkdi_look_levels(desc);
-    for (; c->look[node].child; ++level) {
-        gkd_signature *s = &c->look[node];
-        gkdi_signature_light(s, direction, value);
-        node = (uint32_t)s->child + !(position[s->axis] < s->split);
-    }
-    gkdi_signature_add(&c->look[node], position, direction, value);
-    if (level < levels && c->look_count + 2 <= c->look_capacity &&
-        gkdi_signature_count(&c->look[node]) >= (double)desc->min_samples) {
-        uint32_t axis;
-        float split;
-        if (gkdi_signature_split_axis(&c->look[node], &axis, &split)) {
-            gkd_signature *s = &c->look[node];
-            s->axis = (uint8_t)axis;
-            s->split = split;
-            s->child = (uint16_t)c->look_count;
-            memset(&c->look[c->look_count], 0, 2 * sizeof *c->look);
-            c->look_count += 2;
-        }
-    }
+    uint32_t i, low = begin, high = 0;
+    for (i = begin; i < end; ++i)
+        if (batch->items[i].position[axis] < split)
+            batch->items[low++] = batch->items[i];
+        else
+            batch->other_items[high++] = batch->items[i];
+    memcpy(batch->items + low, batch->other_items, high * sizeof *batch->items);
+    return low;
 }
 
-/* Add a range of a batch to a cell. While the cell itself may yet be divided, one by one. */
-static void gkdi_feed(const gkd_desc *desc, gkdi_cell *c, const gkdi_cell_samples *batch, const uint32_t range[4])
+static uint32_t gkdi_cut_zeros(gkdi_cell_samples *batch, uint32_t begin, uint32_t end, uint32_t axis, float split)
 {
-    static const float none[3] = {0, 0, 1};
-    bool divides = gkdi_look_levels(desc) > 0;
+    uint32_t i, low = begin, high = 0;
+    for (i = begin; i < end; ++i) { /* no branch: it could not be predicted */
+        float zero[3];
+        bool above = !(batch->zeros[i][axis] < split);
+        memcpy(zero, batch->zeros[i], sizeof zero);
+        memcpy(batch->zeros[low], zero, sizeof zero);
+        memcpy(batch->other_zeros[high], zero, sizeof zero);
+        low += !above;
+        high += above;
+    }
+    memcpy(batch->zeros + low, batch->other_zeros, high * sizeof *batch->zeros);
+    return low;
+}
+
+/* A batch on its way down a lookahead tree: items by lists of their indices, which keeps them in the order they came;
+   zeros themselves. */
+typedef struct gkdi_feeder {
+    const gkd_desc *desc;
+    gkdi_cell *cell;
+    gkdi_cell_samples *batch;
+    double from[3]; /* reference point of positions */
+} gkdi_feeder;
+
+typedef struct gkdi_portion {
+    uint32_t *list, count; /* items */
+    uint32_t begin, end;   /* zeros */
+} gkdi_portion;
+
+/* The first `most` samples of a portion, items first, become part of a lookahead cell and are taken out of it. */
+static void gkdi_look_take_in(const gkdi_feeder *f, gkd_signature *s, gkdi_portion *p, double most, gkdi_sum *sum)
+{
+    uint32_t items = (double)p->count < most ? p->count : (uint32_t)most, zeros = p->end - p->begin;
+    gkdi_sum part;
+    memset(&part, 0, sizeof part);
+    gkdi_sum_light(&part, &f->cell->shape, f->batch->items, p->list, items);
+    gkdi_sum_places(&part, f->from, f->batch->items, p->list, items);
+    most -= items;
+    zeros = (double)zeros < most ? zeros : (uint32_t)most;
+    part.samples += zeros;
+    p->list += items;
+    p->count -= items;
+    p->begin += zeros;
+    gkdi_signature_add(s, &part, f->from);
+    gkdi_sum_add(sum, &part);
+}
+
+/* Divide a lookahead cell where its samples allow it: true if it now has children. */
+static bool gkdi_look_divide(gkdi_cell *c, gkd_signature *s)
+{
+    uint32_t axis;
+    float split;
+    if (!gkdi_signature_split_axis(s, &axis, &split))
+        return false;
+    s->axis = (uint8_t)axis;
+    s->split = split;
+    s->child = (uint16_t)c->look_count;
+    memset(&c->look[c->look_count], 0, 2 * sizeof *c->look);
+    c->look_count += 2;
+    return true;
+}
+
+/* Stable partition of a portion by the plane of a lookahead cell: what lies below is left in it, the rest returned. */
+static gkdi_portion gkdi_portion_cut(const gkdi_feeder *f, const gkd_signature *s, gkdi_portion *p)
+{
+    gkdi_portion high;
+    const gkdi_item *items = f->batch->items;
+    uint32_t i, low = 0, up = 0, *other = f->batch->other_list;
+    for (i = 0; i < p->count; ++i) { /* no branch: it could not be predicted */
+        uint32_t at = p->list[i];
+        bool above = !(items[at].position[s->axis] < s->split);
+        p->list[low] = other[up] = at;
+        up += above;
+        low += !above;
+    }
+    memcpy(p->list + low, other, up * sizeof *other);
+    high.list = p->list + low;
+    high.count = up;
+    high.end = p->end;
+    high.begin = p->end = gkdi_cut_zeros(f->batch, p->begin, p->end, s->axis, s->split);
+    p->count = low;
+    return high;
+}
+
+/* Add a portion to lookahead cell `node` (0: the cell itself), which lies `level` below it, and to those below; adds up
+   what was added. Each sample is read where it ends; cells above get the sums of what is below. Where a cell without
+   children has enough samples and levels and room are left, it is divided, and later samples go on below. */
+static void gkdi_look_feed(const gkdi_feeder *f, uint32_t node, uint32_t level, gkdi_portion p, gkdi_sum *sum)
+{
+    gkdi_cell *c = f->cell;
+    gkd_signature *s = &c->look[node];
+    gkdi_portion high;
+    gkdi_sum below;
+    if (p.count == 0 && p.begin == p.end)
+        return;
+    if (!s->child) {
+        double enough = (double)f->desc->min_samples;
+        bool divides = level < gkdi_look_levels(f->desc) && !s->alike && c->look_count + 2 <= c->look_capacity;
+        if (divides)
+            gkdi_look_take_in(f, s, &p, fmax(ceil(enough - s->samples), 1), sum);
+        if (!divides || s->samples < enough || !gkdi_look_divide(c, s)) {
+            gkdi_look_take_in(f, s, &p, 1e10, sum);
+            return;
+        }
+    }
+    memset(&below, 0, sizeof below);
+    high = gkdi_portion_cut(f, s, &p);
+    gkdi_look_feed(f, s->child, level + 1, p, &below);
+    gkdi_look_feed(f, s->child + 1u, level + 1, high, &below);
+    gkdi_signature_add(s, &below, f->from);
+    gkdi_sum_add(sum, &below);
+}
+
+/* Add a range of a batch to a cell; zeros change their order. */
+static void gkdi_feed(const gkd_desc *desc, gkdi_cell *c, gkdi_cell_samples *batch, const uint32_t range[4])
+{
+    gkdi_feeder f;
+    gkdi_portion p;
+    gkdi_sum sum;
     uint32_t i;
-    for (i = range[0]; i < range[1] && divides && !c->look[0].child; ++i) {
-        gkdi_look_add(desc, c, 0, batch->items[i].position, batch->items[i].direction, batch->items[i].weight);
-        gkdi_shape_add(&c->shape, batch->items[i].direction, batch->items[i].weight);
-    }
-    gkdi_signature_add_all(&c->look[0], &c->shape, batch->items + i, range[1] - i);
-    for (; i < range[1] && divides; ++i) {
-        const gkd_signature *s = &c->look[0];
-        const gkdi_item *p = &batch->items[i];
-        gkdi_look_add(desc, c, (uint32_t)s->child + !(p->position[s->axis] < s->split), p->position, p->direction,
-                      p->weight);
-    }
-    for (i = range[2]; i < range[3]; ++i)
-        gkdi_look_add(desc, c, 0, batch->zeros[i], none, 0);
+    f.desc = desc;
+    f.cell = c;
+    f.batch = batch;
+    p.list = batch->list;
+    p.count = range[1] - range[0];
+    p.begin = range[2];
+    p.end = range[3];
+    for (i = 0; i < 3; ++i)
+        f.from[i] = c->look[0].lit > 0 || !p.count ? c->look[0].mean[i] : (double)batch->items[range[0]].position[i];
+    for (i = 0; i < p.count; ++i)
+        p.list[i] = range[0] + i;
+    memset(&sum, 0, sizeof sum);
+    gkdi_look_feed(&f, 0, 0, p, &sum);
     c->lit += range[1] - range[0];
 }
 
@@ -3253,6 +3422,58 @@ static uint32_t gkdi_wants_split(const gkd_field *field, const gkdi_cell *c)
     for (i = 1; i < c->look_count && asks != mask; ++i)
         asks |= (uint32_t)gkdi_compare(&field->tests, &c->look[0], &c->shape, &c->look[i]) & mask;
     return asks;
+}
+
+/* Take lookahead cells without use out of a cell's tree. used: 1 for those that are left, whose order stays. */
+static void gkdi_look_pack(gkdi_cell *c, const unsigned char *used)
+{
+    uint16_t place[GKDI_MAX_LOOK];
+    uint32_t i, count = 0;
+    for (i = 0; i < c->look_count; ++i)
+        place[i] = (uint16_t)(used[i] ? count++ : 0);
+    for (i = 0; i < c->look_count; ++i)
+        if (used[i]) {
+            c->look[place[i]] = c->look[i];
+            c->look[place[i]].child = c->look[i].child ? place[c->look[i].child] : 0;
+        }
+    c->look_count = count;
+}
+
+/* Give up the children of lookahead cells of which both are surely like the cell, from the last level up, so that
+   nothing is given up of which the parts were not seen. Those about them stay and are asked again at every update; when
+   they differ, or have about doubled their samples (alike holds log2 of these), they grow again: light may have changed
+   in a small part of them. Returns how many were given up. */
+static uint32_t gkdi_look_prune(const gkd_field *field, gkdi_cell *c)
+{
+    const gkd_desc *desc = &field->desc;
+    unsigned char level[GKDI_MAX_LOOK], used[GKDI_MAX_LOOK];
+    uint32_t i, k, gone = 0;
+    memset(used, 1, sizeof used);
+    for (i = level[0] = 0; i < c->look_count; ++i) /* children come after their parents */
+        for (k = 0; k < 2 && c->look[i].child; ++k)
+            level[c->look[i].child + k] = (unsigned char)(level[i] + 1);
+    for (i = c->look_count; i-- > 1;) {
+        gkd_signature *s = &c->look[i], *child = &c->look[s->child];
+        uint32_t doubled = 1 + (uint32_t)ilogb(fmin(s->samples + 1, 1e70));
+        bool same;
+        if (s->child && child[0].alike && child[1].alike) {
+            used[s->child] = used[s->child + 1] = 0;
+            gone += 2;
+            s->child = 0;
+            s->alike = (uint8_t)doubled;
+        }
+        if (s->child || (!s->alike && level[i] < gkdi_look_levels(desc)))
+            continue;
+        same = gkdi_alike(&field->tests, &c->look[0], &c->shape, s, !desc->no_radiance_test, !desc->no_direction_test);
+        if (level[i] < gkdi_look_levels(desc))
+            same = same && s->alike == doubled;
+        s->alike = (uint8_t)(same ? doubled : 0);
+    }
+    if (gone) {
+        gkdi_look_pack(c, used);
+        gkdi_look_resize(desc, c, gkdi_look_room(desc, c->look_count)); /* or it stays large */
+    }
+    return gone;
 }
 
 /* Make `to` the part of `from` below node `root` of its lookahead tree. What was seen counts `keep` times: 0 leaves
@@ -3273,6 +3494,7 @@ static void gkdi_look_take(const gkdi_cell *from, uint32_t root, gkdi_cell *to, 
         d->axis = s->axis;
         d->split = s->split;
         d->child = 0;
+        d->alike = 0; /* another cell to be like */
         if (!s->child)
             continue;
         d->child = (uint16_t)to->look_count;
@@ -3283,31 +3505,6 @@ static void gkdi_look_take(const gkdi_cell *from, uint32_t root, gkdi_cell *to, 
         gkdi_shape_scale(&to->shape, to->look[0].squares / from->look[0].squares);
     else
         memset(&to->shape, 0, sizeof to->shape);
-}
-
-/* Stable partition of a range by a plane; the first part's end. */
-static uint32_t gkdi_cut_items(gkdi_cell_samples *batch, uint32_t begin, uint32_t end, uint32_t axis, float split)
-{
-    uint32_t i, low = begin, high = 0;
-    for (i = begin; i < end; ++i)
-        if (batch->items[i].position[axis] < split)
-            batch->items[low++] = batch->items[i];
-        else
-            batch->other_items[high++] = batch->items[i];
-    memcpy(batch->items + low, batch->other_items, high * sizeof *batch->items);
-    return low;
-}
-
-static uint32_t gkdi_cut_zeros(gkdi_cell_samples *batch, uint32_t begin, uint32_t end, uint32_t axis, float split)
-{
-    uint32_t i, low = begin, high = 0;
-    for (i = begin; i < end; ++i)
-        if (batch->zeros[i][axis] < split)
-            memcpy(batch->zeros[low++], batch->zeros[i], sizeof *batch->zeros);
-        else
-            memcpy(batch->other_zeros[high++], batch->zeros[i], sizeof *batch->zeros);
-    memcpy(batch->zeros + low, batch->other_zeros, high * sizeof *batch->zeros);
-    return low;
 }
 
 /* Room for one more cell and two more nodes. */
@@ -3389,6 +3586,8 @@ static bool gkdi_divide(const gkd_field *field, gkdi_outcome *o, uint32_t at, ui
     old->gate.fresh /= 2;
     old->gate.flow /= 2;
     old->level++;
+    old->calm = 0;
+    old->wakes = 0;
     if (!gkdi_cell_copy(desc, old, &low))
         return false;
     if (!gkdi_cell_copy(desc, old, &high)) {
@@ -3548,26 +3747,69 @@ static bool gkdi_model_room(const gkd_desc *desc, gkdi_cell *c, uint32_t lobes)
     return true;
 }
 
+/* Kullback-Leibler divergence, in nats, of a mixture from what it was before: at most that of the weights and the mean
+   of that of pairs of lobes (log-sum inequality). Of lobes, with C = kappa / (2 pi (1 - exp(-2 kappa))) and A the mean
+   cosine, it is log(C'/C) + A' (kappa' - kappa mean' . mean) - (kappa' - kappa). Pairs are by index: infinite where
+   their number changed, large where some were split and others merged. */
+static double gkdi_divergence(const gkdi_model *before, const gkdi_model *now, const gkdi_fit_options *o)
+{
+    gkdi_mixture p, q;
+    double bound = 0;
+    uint32_t k;
+    if (before->count != now->count || !now->count)
+        return (double)INFINITY;
+    gkdi_maximise(&before->sums, before->count, o, &q);
+    gkdi_maximise(&now->sums, now->count, o, &p);
+    for (k = 0; k < now->count; ++k) {
+        const float mp[3] = {p.x[k], p.y[k], p.z[k]}, mq[3] = {q.x[k], q.y[k], q.z[k]};
+        double w = (double)p.weight[k], kp = (double)p.kappa[k], kq = (double)q.kappa[k];
+        double lobes = log(gkdi_peak(kp) / gkdi_peak(kq)) - (kp - kq) +
+                       gkdi_mean_cosine(kp) * (kp - kq + kq * 0.5 * gkdi_distance2(mp, mq));
+        bound += w > 0 ? w * (log(w / gkdi_max((double)q.weight[k], 1e-30)) + lobes) : 0;
+    }
+    return bound;
+}
+
+/* After a fit: could the mixture rest? If it moved by at most GKDI_CALM nats, over the share h of its samples that was
+   new (own). Noise: where d is how far a mixture of all samples is from the truth, a fit moves it by about h d. Change:
+   light that is D from what is known moves it by h^2 D. So d and h D are small. After GKDI_CALM_FITS of these in a row
+   it rests until the cell has seen twice the samples; if it moves then, it is awake. */
+static void gkdi_calm(gkdi_cell *c, const gkdi_model *before, const gkdi_model *now, uint32_t n,
+                      const gkdi_fit_options *o)
+{
+    double share = gkdi_min(n / gkdi_max((double)now->samples, 1), 1);
+    bool calm = gkdi_divergence(before, now, o) <= (double)GKDI_CALM * share;
+    c->calm = !calm ? 0 : c->calm < GKDI_CALM_FITS ? c->calm + 1 : c->calm;
+    c->wakes = c->calm == GKDI_CALM_FITS ? 2 * c->lit : 0;
+}
+
 /* Learn a cell's mixture from items, seen from the mean position of all that the cell has seen. False = out of memory:
    it stays as it was. */
 static bool gkdi_fit_cell(const gkd_field *field, gkdi_outcome *o, gkdi_cell *c, const gkdi_item *items, uint32_t n)
 {
     const gkd_desc *desc = &field->desc;
-    gkdi_model model;
+    gkdi_model model, before;
     float pivot[3];
     if (n == 0 || desc->no_mixtures)
         return true;
+    if (c->lit < c->wakes) {
+        o->rests++;
+        return true;
+    }
     gkdi_signature_mean(&c->look[0], pivot);
     if (c->model) {
         gkdi_model_unpack(&model, c->model);
         gkdi_model_move(&model, pivot, &field->fit);
     } else
         gkdi_model_init(&model, pivot);
+    before = model;
     gkdi_model_fit(&model, items, n, &field->fit);
     if (!gkdi_model_room(desc, c, model.count))
         return false;
     gkdi_model_pack(&model, c->model);
     o->fits++;
+    if (!desc->no_rest)
+        gkdi_calm(c, &before, &model, n, &field->fit);
     return true;
 }
 
@@ -3611,7 +3853,8 @@ static void gkdi_update_cell(const gkdi_update *u, gkdi_outcome *o, gkdi_cell_sa
             return;
         gkdi_outcome_free(desc, o);
         o->denied++;
-    }
+    } else if (desc->split == GKD_SPLIT_SIGNATURE && !desc->no_prune)
+        o->alike += gkdi_look_prune(field, c);
     gkdi_fit_cell(field, o, c, batch->items, range[1]);
 }
 
@@ -3626,16 +3869,19 @@ static void gkdi_update_cells(void *context, uint32_t begin, uint32_t end)
         n = u->outcomes[k].end - u->outcomes[k].first > n ? u->outcomes[k].end - u->outcomes[k].first : n;
     batch.items = (gkdi_item *)desc->allocate(desc->user, n * 2 * sizeof *batch.items);
     batch.zeros = (float(*)[3])desc->allocate(desc->user, n * 2 * sizeof *batch.zeros);
+    batch.list = (uint32_t *)desc->allocate(desc->user, n * 2 * sizeof *batch.list);
     for (k = begin; k < end; ++k) {
-        u->outcomes[k].failed = !batch.items || !batch.zeros;
+        u->outcomes[k].failed = !batch.items || !batch.zeros || !batch.list;
         if (u->outcomes[k].failed)
             continue;
         batch.other_items = batch.items + n;
         batch.other_zeros = batch.zeros + n;
+        batch.other_list = batch.list + n;
         gkdi_update_cell(u, &u->outcomes[k], &batch);
     }
     gkdi_release(desc, batch.items);
     gkdi_release(desc, batch.zeros);
+    gkdi_release(desc, batch.list);
 }
 
 static bool gkdi_finite(float x) { return x - x == 0; }
@@ -3860,6 +4106,8 @@ static void gkdi_update_commit(gkdi_update *u, const uint32_t *leaves)
         field->stats.direction_splits += o->direction_splits;
         field->stats.denied_splits += o->denied;
         field->stats.fits += o->fits;
+        field->stats.rests += o->rests;
+        field->stats.alike += o->alike;
         if (o->failed) {
             field->stats.samples -= o->end - o->first;
             field->stats.lost += o->end - o->first;
@@ -5445,8 +5693,8 @@ typedef struct gkdi_header {
 typedef struct gkdi_saved_cell {
     gkdi_gate gate;
     gkdi_shape shape;
-    double lit;
-    uint32_t look_count, model_words, level, reserved;
+    double lit, wakes;
+    uint32_t look_count, model_words, level, calm;
 } gkdi_saved_cell;
 
 static const char gkdi_magic[8] = {'g', 'u', 'i', 'd', 'e', '_', 'k', 'd'};
@@ -5473,7 +5721,8 @@ static gkdi_options gkdi_options_of(const gkd_desc *d)
     o.lookahead = d->lookahead;
     o.min_samples = d->min_samples;
     o.flags = (d->no_radiance_test ? 1u : 0) | (d->no_direction_test ? 2u : 0) | (d->keep_signatures ? 4u : 0) |
-              (d->no_mixtures ? 8u : 0) | (d->no_gate ? 16u : 0) | (d->published_tests ? 32u : 0);
+              (d->no_mixtures ? 8u : 0) | (d->no_gate ? 16u : 0) | (d->published_tests ? 32u : 0) |
+              (d->no_prune ? 64u : 0) | (d->no_rest ? 128u : 0);
     o.max_levels = d->max_levels;
     o.max_lobes = d->max_lobes;
     o.update_samples = d->update_samples;
@@ -5505,6 +5754,8 @@ static void gkdi_options_to(const gkdi_options *o, gkd_desc *d)
     d->no_mixtures = (o->flags & 8u) != 0;
     d->no_gate = (o->flags & 16u) != 0;
     d->published_tests = (o->flags & 32u) != 0;
+    d->no_prune = (o->flags & 64u) != 0;
+    d->no_rest = (o->flags & 128u) != 0;
     d->max_levels = o->max_levels;
     d->max_lobes = o->max_lobes;
     d->update_samples = o->update_samples;
@@ -5590,6 +5841,8 @@ GKD_API gkd_result gkd_save(const gkd_field *field, void *data, size_t capacity,
         s.gate = c->gate;
         s.shape = c->shape;
         s.lit = c->lit;
+        s.wakes = c->wakes;
+        s.calm = c->calm;
         s.look_count = c->look_count;
         s.model_words = c->model_capacity;
         s.level = c->level;
@@ -5761,7 +6014,8 @@ GKD_API gkd_result gkd_validate(const gkd_field *field)
     for (i = 0; ok && i < field->cell_count; ++i) {
         const gkdi_cell *c = &field->cells[i];
         ok = gkdi_look_valid(c, most) && gkdi_gate_valid(&c->gate) && c->lit >= 0 && c->lit < INFINITY &&
-             c->level <= 60 && (!c->model || gkdi_model_valid(c->model, c->model_capacity));
+             c->wakes >= 0 && c->wakes < INFINITY && c->calm <= GKDI_CALM_FITS && c->level <= 60 &&
+             (!c->model || gkdi_model_valid(c->model, c->model_capacity));
     }
     for (i = 0; ok && i < field->split_count; ++i)
         ok = field->splits[i].parent < field->cell_count && field->splits[i].child < field->cell_count;
@@ -5788,6 +6042,8 @@ static gkd_result gkdi_load_parts(gkd_field *f, const gkdi_header *h, gkdi_reade
         c->gate = saved[i].gate;
         c->shape = saved[i].shape;
         c->lit = saved[i].lit;
+        c->wakes = saved[i].wakes;
+        c->calm = saved[i].calm;
         c->level = saved[i].level;
         c->look = (gkd_signature *)gkdi_read(r, d, saved[i].look_count, sizeof *c->look);
         c->look_count = c->look_capacity = saved[i].look_count;

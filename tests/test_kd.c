@@ -958,6 +958,172 @@ static void test_signature_rule_splits_at_an_edge_of_light_only(void **state)
     }
 }
 
+/* With keep_signatures a half goes on with what its lookahead cell saw, which tells where its samples lie: all of them,
+   also those that came after that cell was divided, and lay elsewhere. What came before it was made it does not know.
+ */
+static void test_kept_signatures_know_where_their_samples_lie(void **state)
+{
+    (void)state;
+    enum { N = 30000, PASSES = 3 };
+    static gkd_training_sample s[PASSES * N];
+    gkd_desc d = unit_cube();
+    gkd_field *f;
+    d.keep_signatures = 0.5f;
+    seed(53);
+    OK(gkd_create(&d, &f));
+    for (int pass = 0; pass < PASSES; ++pass) {
+        plain_samples(s + pass * N, N, pass == 2);
+        for (int i = pass * N; i < pass * N + N; ++i)
+            s[i].position[1] = 0.2f * s[i].position[1] + 0.4f * (float)pass;
+        assert_int_equal(gkd_cell_count(f), 1);
+        learn(f, s + pass * N, N);
+        OK(gkd_refine(f, NULL, NULL, NULL));
+    }
+    OK(gkd_validate(f));
+    gkd_view v = gkd_get_view(f);
+    assert_in_range(v.cell_count, 2, 1000);
+    double *sum = test_calloc(v.cell_count, 4 * sizeof *sum);
+    for (int i = 0; i < PASSES * N; ++i) {
+        double *c = sum + 4 * gkd_find_cell(&v, s[i].position);
+        for (int k = 0; k < 3; ++k)
+            c[k] += (double)s[i].position[k];
+        c[3]++;
+    }
+    for (uint32_t i = 0; i < v.cell_count; ++i)
+        for (int k = 0; k < 3 && sum[4 * i + 3] > 0; ++k)
+            assert_true(fabs((double)v.cells[i].pivot[k] - sum[4 * i + (uint32_t)k] / sum[4 * i + 3]) < 0.05);
+    test_free(sum);
+    gkd_destroy(f);
+}
+
+/* n samples of light from a cap around +z, half of it 0.5 and half 1.5 bright; none in the corner where all coordinates
+   are below `shadow`. */
+static void cap_samples(gkd_training_sample *s, uint32_t n, float shadow)
+{
+    for (uint32_t i = 0; i < n; ++i) {
+        float p[3] = {rndf(), rndf(), rndf()}, z = 1 - 0.2f * rndf(), a = (float)(2 * PI) * rndf(), L;
+        float w[3] = {sqrtf(1 - z * z) * cosf(a), sqrtf(1 - z * z) * sinf(a), z};
+        L = p[0] < shadow && p[1] < shadow && p[2] < shadow ? 0.0f : rnd() < 0.5 ? 0.5f : 1.5f;
+        s[i] = gkd_make_scalar_sample(p, w, NULL, INFINITY, L, L, L, (float)UNIFORM, (float)UNIFORM, 0);
+    }
+}
+
+/* Passes without and then with a shadow. */
+static gkd_field *look_at_caps(bool no_prune, int bright, int passes, gkd_stats *before)
+{
+    enum { N = 100000 };
+    static gkd_training_sample s[N];
+    gkd_desc d = unit_cube();
+    gkd_field *f;
+    d.no_mixtures = true;
+    d.no_prune = no_prune;
+    seed(54);
+    OK(gkd_create(&d, &f));
+    for (int pass = 0; pass < passes; ++pass) {
+        if (pass == bright)
+            gkd_get_stats(f, before);
+        cap_samples(s, N, pass < bright ? 0 : 0.25f);
+        learn(f, s, N);
+        OK(gkd_refine(f, NULL, NULL, NULL));
+        OK(gkd_validate(f));
+    }
+    return f;
+}
+
+/* Light that is the same everywhere: the lookahead cells go, and nothing splits. A shadow of a sixty-fourth of the cell
+   is found whether it was there from the start or comes later. */
+static void test_lookahead_cells_go_where_light_is_even_and_come_back(void **state)
+{
+    (void)state;
+    gkd_stats even, kept, s;
+    gkd_field *f = look_at_caps(false, 12, 30, &even), *g = look_at_caps(true, 12, 30, &kept);
+    assert_int_equal(even.cells, 1);
+    assert_int_equal(kept.cells, 1);
+    assert_int_equal(kept.lookahead, 126);
+    assert_int_equal(kept.alike, 0);
+    assert_in_range(even.lookahead, 2, 60);
+    assert_true(even.alike > 60 && even.bytes + 40 * sizeof(gkd_signature) < kept.bytes);
+    gkd_get_stats(f, &s);
+    assert_in_range(s.cells, 2, 1000);
+    gkd_destroy(f);
+    gkd_destroy(g);
+    f = look_at_caps(false, 0, 4, &even);
+    g = look_at_caps(true, 0, 4, &kept);
+    assert_in_range(gkd_cell_count(g), 2, 1000);
+    assert_true(gkd_structure_id(f) == gkd_structure_id(g));
+    gkd_destroy(f);
+    gkd_destroy(g);
+}
+
+/* Passes of samples from a lamp that, from pass `moved` on, hangs on the other side; one cell. */
+static gkd_field *watch_lamp(bool no_rest, int passes, int moved, gkd_stats *stats)
+{
+    enum { N = 4000 };
+    static gkd_training_sample s[N];
+    gkd_desc d = unit_cube();
+    gkd_field *f;
+    d.no_radiance_test = d.no_direction_test = d.no_gate = true;
+    d.no_rest = no_rest;
+    seed(55);
+    OK(gkd_create(&d, &f));
+    for (int pass = 0; pass < passes; ++pass) {
+        for (int i = 0; i < N; ++i) {
+            float p[3] = {rndf(), rndf(), rndf()}, w[3], side = pass < moved ? 1.0f : -1.0f, L;
+            random_direction(w);
+            L = side * w[2] > 0.8f ? 10 : 1;
+            s[i] = gkd_make_scalar_sample(p, w, NULL, INFINITY, L, L, L, (float)UNIFORM, (float)UNIFORM, 0);
+        }
+        learn(f, s, N);
+        OK(gkd_refine(f, NULL, NULL, NULL));
+    }
+    OK(gkd_validate(f));
+    gkd_get_stats(f, stats);
+    return f;
+}
+
+/* Mean log density, weighted by the light of the lamp at +z (or -z): what expectation maximisation maximises. */
+static double quality(const gkd_field *f, float side)
+{
+    const float p[3] = {0.5f, 0.5f, 0.5f};
+    gkd_view v = gkd_get_view(f);
+    gkd_handle h;
+    double sum = 0, weight = 0;
+    gkd_find(&v, p, NULL, NULL, &h);
+    seed(56);
+    for (int i = 0; i < 100000; ++i) {
+        float w[3];
+        random_direction(w);
+        double L = side * w[2] > 0.8f ? 10 : 1;
+        sum += L * log((double)gkd_pdf(&h, w));
+        weight += L;
+    }
+    return sum / weight;
+}
+
+/* A mixture that no longer changes rests, at next to no loss; light that changes later wakes it. */
+static void test_converged_mixtures_rest_and_wake(void **state)
+{
+    (void)state;
+    gkd_stats rested, never;
+    gkd_field *f = watch_lamp(false, 80, 1000, &rested), *g = watch_lamp(true, 80, 1000, &never);
+    assert_int_equal(never.rests, 0);
+    assert_int_equal(never.fits, 80);
+    assert_int_equal(rested.fits + rested.rests, 80);
+    assert_true(rested.rests > 30);
+    assert_true(quality(f, 1) > quality(g, 1) - 0.01);
+    gkd_destroy(f);
+    gkd_destroy(g);
+    f = watch_lamp(false, 40, 1000, &rested);
+    assert_true(rested.rests > 20 && quality(f, -1) < -3); /* asleep when the lamp moves */
+    gkd_destroy(f);
+    f = watch_lamp(false, 240, 40, &rested);
+    g = watch_lamp(true, 240, 40, &never);
+    assert_true(rested.rests > 30);
+    assert_true(quality(f, -1) > quality(g, -1) - 0.05);
+    gkd_destroy(f);
+    gkd_destroy(g);
+}
+
 /* ---- split reports */
 
 typedef struct replay {
@@ -1551,6 +1717,9 @@ int main(void)
         cmocka_unit_test(test_training_is_the_same_at_every_level),
         cmocka_unit_test(test_count_rule_splits_at_the_documented_number),
         cmocka_unit_test(test_signature_rule_splits_at_an_edge_of_light_only),
+        cmocka_unit_test(test_kept_signatures_know_where_their_samples_lie),
+        cmocka_unit_test(test_lookahead_cells_go_where_light_is_even_and_come_back),
+        cmocka_unit_test(test_converged_mixtures_rest_and_wake),
         cmocka_unit_test(test_split_reports_let_another_model_follow),
         cmocka_unit_test(test_save_and_load_go_on_training_the_same),
         cmocka_unit_test(test_truncated_and_flipped_saves_are_refused),

@@ -12,6 +12,38 @@
 #define GKD_IMPLEMENTATION
 #include "guide_kd.h"
 
+/* One sample, as the header adds a batch. */
+static void add_sample(gkd_signature *s, const float p[3], const float d[3], float v)
+{
+    const uint32_t list[1] = {0};
+    const double from[3] = {(double)p[0], (double)p[1], (double)p[2]};
+    gkdi_shape shape;
+    gkdi_sum sum;
+    gkdi_item item;
+    memset(&sum, 0, sizeof sum);
+    memset(&shape, 0, sizeof shape);
+    memcpy(item.position, p, sizeof item.position);
+    memcpy(item.direction, d, sizeof item.direction);
+    item.weight = v;
+    if (v > 0) {
+        gkdi_sum_light(&sum, &shape, &item, list, 1);
+        gkdi_sum_places(&sum, from, &item, list, 1);
+    } else
+        sum.samples = 1;
+    gkdi_signature_add(s, &sum, from);
+}
+
+static void add_shape(gkdi_shape *shape, const float d[3], float v)
+{
+    const uint32_t list[1] = {0};
+    gkdi_sum sum;
+    gkdi_item item;
+    memset(&sum, 0, sizeof sum);
+    memcpy(item.direction, d, sizeof item.direction);
+    item.weight = v;
+    gkdi_sum_light(&sum, shape, &item, list, 1);
+}
+
 static void merge_signature(gkd_signature *s, const gkd_signature *from)
 {
     double a = (double)s->lit, b = (double)from->lit, share = b > 0 ? b / (a + b) : 0;
@@ -155,7 +187,7 @@ static void test_kappa(void)
         int i;
         memset(&s, 0, sizeof s);
         for (i = 0; i < 100000; ++i)
-            gkdi_signature_add(&s, p, d, 1e30f);
+            add_sample(&s, p, d, 1e30f);
         CHECK(gkdi_reference_variance(&s) > 0 && gkdi_reference_variance(&s) < 1e-11, "single direction: %g",
               gkdi_reference_variance(&s));
     }
@@ -179,7 +211,7 @@ static void test_sums(void)
         p[0] = (float)(offset + (double)(r & 15) / 16);
         p[1] = (float)(offset + (double)(r >> 4 & 3) / 16);
         p[2] = 5;
-        gkdi_signature_add(&s, p, d, r & 256 ? 0.1f : 0.0f);
+        add_sample(&s, p, d, r & 256 ? 0.1f : 0.0f);
     }
     say("sums: %g adds in %.2f s\n", n, seconds() - start);
     for (k = 0; k < 16; ++k)
@@ -202,7 +234,7 @@ static void test_sums(void)
     total.variance[0] = 1;
     for (k = 0; k < 4000000; ++k) {
         p[0] = (float)(k & 1);
-        gkdi_signature_add(&total, p, d, 1);
+        add_sample(&total, p, d, 1);
     }
     CHECK(fabs((double)total.variance[0] - 0.25) < 0.02 && fabs(total.mean[0] - 0.5) < 1e-6, "window: %g",
           (double)total.variance[0]);
@@ -228,8 +260,8 @@ static void test_sums(void)
             float v = draw() & 1 ? (float)uniform() : 0;
             for (j = 0; j < 3; ++j)
                 p[j] = (float)(uniform() + j);
-            gkdi_signature_add(&all, p, d, v);
-            gkdi_signature_add(&part[k % 7 ? k < 500 : 2], p, d, v);
+            add_sample(&all, p, d, v);
+            add_sample(&part[k % 7 ? k < 500 : 2], p, d, v);
         }
         merge_signature(&part[0], &part[1]);
         merge_signature(&part[0], &part[2]);
@@ -251,6 +283,60 @@ static void test_sums(void)
     }
 }
 
+/* A pool of samples over and over, in batches of different length: 1e7 of them, with GUIDE_TEST_LONG set 1e9. Truth is
+   the pool's sums in extended precision, times how often it came. */
+static void test_drift(void)
+{
+    enum { N = 1 << 14 };
+    static gkdi_item items[N];
+    static uint32_t list[N];
+    const uint32_t turns = getenv("GUIDE_TEST_LONG") ? 61036 : 611;
+    const double from[3] = {1e4, 1e4, 1e4};
+    long double sum = 0, squares = 0, direction = 0, mean = 0, spread = 0;
+    gkd_signature s;
+    gkdi_shape shape;
+    double start = seconds(), worst;
+    uint32_t i, k, turn_number;
+    memset(&s, 0, sizeof s);
+    memset(&shape, 0, sizeof shape);
+    for (i = 0; i < N; ++i) {
+        double d[3];
+        draw_vmf(3, d);
+        list[i] = i;
+        for (k = 0; k < 3; ++k) {
+            items[i].direction[k] = (float)d[k];
+            items[i].position[k] = (float)(1e4 + uniform());
+        }
+        items[i].weight = (float)exp(2 * normal());
+        sum += (long double)items[i].weight;
+        squares += (long double)items[i].weight * (long double)items[i].weight;
+        direction += (long double)items[i].weight * (long double)items[i].direction[2];
+        mean += (long double)items[i].position[0] / N;
+    }
+    for (i = 0; i < N; ++i)
+        spread += ((long double)items[i].position[0] - mean) * ((long double)items[i].position[0] - mean) / N;
+    for (turn_number = 0; turn_number < turns; ++turn_number)
+        for (i = 0; i < N; i += k) {
+            gkdi_sum part;
+            k = 1 + draw() % 4096;
+            k = k < N - i ? k : N - i;
+            memset(&part, 0, sizeof part);
+            gkdi_sum_light(&part, &shape, items, list + i, k);
+            gkdi_sum_places(&part, from, items, list + i, k);
+            gkdi_signature_add(&s, &part, from);
+        }
+    worst = fmax(fabs((double)(s.sum / (sum * turns) - 1)), fabs((double)(s.squares / (squares * turns) - 1)));
+    worst = fmax(worst, fabs((double)(s.direction[2] / (direction * turns) - 1)));
+    worst = fmax(worst, fabs((double)((shape.s[0] + shape.s[1] + shape.s[2]) / (squares * turns) - 1)) - 1e-7);
+    say("drift: %g samples in %.2f s, sums %.2g off, mean %.2g, variance %.2g\n", s.samples, seconds() - start, worst,
+        (double)(s.mean[0] - mean), (double)((long double)s.variance[0] / spread - 1));
+    CHECK(s.samples == (double)N * turns, "samples %.17g", s.samples);
+    CHECK(worst < 1e-12, "sums %g off", worst);
+    CHECK(fabs((double)(s.mean[0] - mean)) < 1e-4, "mean %g off", (double)(s.mean[0] - mean));
+    CHECK(fabs((double)((long double)s.variance[0] / spread - 1)) < 1e-3, "variance %g", (double)s.variance[0]);
+    CHECK(gkdi_signature_valid(&s), "valid");
+}
+
 static void test_split_axis(void)
 {
     static const float base[] = {0, 1, -1, 1e6f, -1e6f, 1e30f, 1e-40f, 0.1f};
@@ -268,10 +354,10 @@ static void test_split_axis(void)
             memset(&s, 0, sizeof s);
             p[2] = base[b];
             for (i = 0; i < many; ++i)
-                gkdi_signature_add(&s, p, none, 1);
+                add_sample(&s, p, none, 1);
             CHECK(!gkdi_signature_split_axis(&s, &axis, &split), "coincident at %g", (double)base[b]);
             p[2] = q; /* the next float: one sample among many */
-            gkdi_signature_add(&s, p, none, 1);
+            add_sample(&s, p, none, 1);
             if (base[b] < 1e29f && fabsf(base[b]) > 1e-30f) {
                 bool ok = gkdi_signature_split_axis(&s, &axis, &split);
                 if (s.variance[2] > 0)
@@ -293,7 +379,7 @@ static void test_split_axis(void)
                 p[1] = v[i];
                 low = v[i] < low ? v[i] : low;
                 high = v[i] > high ? v[i] : high;
-                gkdi_signature_add(&s, p, none, 1);
+                add_sample(&s, p, none, 1);
             }
             if (gkdi_signature_split_axis(&s, &axis, &split)) {
                 worst = low < split && high >= split && axis == 1 ? worst : 0;
@@ -779,10 +865,10 @@ static void cell_add(cell *c, const float p[3], const float d[3], float v)
 {
     uint32_t node = 0, level = 0;
     if (v > 0)
-        gkdi_shape_add(&c->shape, d, v);
+        add_shape(&c->shape, d, v);
     for (;;) {
         gkd_signature *s = &c->look[node];
-        gkdi_signature_add(s, p, d, v);
+        add_sample(s, p, d, v);
         if (s->child) {
             node = s->child + (uint32_t) !(p[s->axis] < s->split);
             ++level;
@@ -801,6 +887,76 @@ static void cell_add(cell *c, const float p[3], const float d[3], float v)
         }
         return;
     }
+}
+
+/* Batches against their samples one by one, which every lookahead cell sees in which they lie: the same tree, the same
+   sums, and the mean position of all that was seen also where a cell was divided on the way. */
+static void test_batches(void)
+{
+    enum { MOST = 6000, BATCHES = 40 };
+    static gkdi_item items[MOST], other_items[MOST];
+    static float zeros[MOST][3], other_zeros[MOST][3];
+    static uint32_t list[MOST], other_list[MOST];
+    static cell naive;
+    gkdi_cell_samples batch = {items, other_items, zeros, other_zeros, list, other_list};
+    gkdi_cell c;
+    gkd_desc desc;
+    uint32_t i, k;
+    int b;
+    memset(&desc, 0, sizeof desc);
+    desc.bounds_max[0] = desc.bounds_max[1] = desc.bounds_max[2] = 1;
+    CHECK(!gkd_resolve(&desc, &desc), "resolve");
+    memset(&naive, 0, sizeof naive);
+    memset(&c, 0, sizeof c);
+    CHECK(gkdi_look_resize(&desc, &c, NODES), "memory");
+    naive.count = c.look_count = 1;
+    for (b = 0; b < BATCHES; ++b) {
+        uint32_t range[4] = {3, 3, 1, 1}, n = (uint32_t)((MOST - 3) * uniform());
+        double drift = b / (double)BATCHES;
+        for (i = 0; i < n; ++i) {
+            float p[3] = {(float)uniform(), (float)(0.5 * uniform() + 0.5 * drift), (float)(0.3 * uniform())};
+            if (draw() % 3 && range[1] < MOST) {
+                double d[3];
+                draw_vmf(5, d);
+                for (k = 0; k < 3; ++k) {
+                    items[range[1]].position[k] = p[k];
+                    items[range[1]].direction[k] = (float)d[k];
+                }
+                items[range[1]++].weight = (float)exp(normal());
+            } else
+                memcpy(zeros[range[3]++], p, sizeof p);
+        }
+        for (i = range[0]; i < range[1]; ++i)
+            cell_add(&naive, items[i].position, items[i].direction, items[i].weight);
+        for (i = range[2]; i < range[3]; ++i)
+            cell_add(&naive, zeros[i], items[3].direction, 0);
+        gkdi_feed(&desc, &c, &batch, range);
+    }
+    CHECK(naive.count == c.look_count && c.look_count > 80 && c.look[0].samples > 5e4, "%u, not %u lookahead cells",
+          c.look_count, naive.count);
+    {
+        uint32_t same[NODES] = {0}; /* numbers differ: lookahead cells are made in another order */
+        for (i = 0; i < naive.count && i < c.look_count; ++i) {
+            const gkd_signature *x = &naive.look[i], *y = &c.look[same[i]];
+            double far = 0, wide = 0, turned = 0;
+            for (k = 0; k < 3; ++k) {
+                far = fmax(far, fabs(x->mean[k] - y->mean[k]));
+                wide = fmax(wide, fabs((double)x->variance[k] - (double)y->variance[k]));
+                turned = fmax(turned, fabs(x->direction[k] - y->direction[k]));
+            }
+            CHECK(x->samples == y->samples && x->lit == y->lit && !x->child == !y->child && x->axis == y->axis &&
+                      fabs((double)x->split - (double)y->split) < 1e-7,
+                  "lookahead cell %u: %g samples, not %g", i, y->samples, x->samples);
+            CHECK(fabs(x->sum / y->sum - 1) < 1e-12 && fabs(x->squares / y->squares - 1) < 1e-12 &&
+                      turned < 1e-11 * x->sum && far < 1e-12 && wide < 1e-5,
+                  "lookahead cell %u: mean %g, variance %g, direction %g off", i, far, wide, turned);
+            for (k = 0; x->child && y->child && k < 2; ++k)
+                same[x->child + k] = y->child + k;
+        }
+    }
+    for (k = 0; k < 6; ++k)
+        CHECK(fabs(naive.shape.s[k] - c.shape.s[k]) < 1e-11 * c.look[0].squares, "shape");
+    gkdi_cell_free(&desc, &c);
 }
 
 static int cell_asks(const gkdi_split_tests *t, const cell *c)
@@ -1048,8 +1204,8 @@ static void test_extremes(void)
         values[7] = (double)NAN;
         for (i = 0; i < 5000; ++i) {
             float p[3] = {0, 0, 0}, dir[3] = {0, 0.6f, 0.8f};
-            gkdi_signature_add(&g, p, dir, (float)uniform());
-            gkdi_shape_add(&shape, dir, 1);
+            add_sample(&g, p, dir, (float)uniform());
+            add_shape(&shape, dir, 1);
         }
         l = g;
         for (k = 0; k < 4; ++k)
@@ -1083,9 +1239,9 @@ static void test_extremes(void)
         memset(&g, 0, sizeof g);
         memset(&l, 0, sizeof l);
         for (i = 0; i < 10000; ++i) {
-            gkdi_signature_add(&g, p, dir, 1);
+            add_sample(&g, p, dir, 1);
             if (i < 2000)
-                gkdi_signature_add(&l, p, back, 1);
+                add_sample(&l, p, back, 1);
         }
         merge_signature(&g, &l);
         for (k = 0; k < 4; ++k)
@@ -1097,16 +1253,16 @@ static void test_extremes(void)
         float p[3] = {0, 0, 0}, dir[3] = {0, 0.6f, 0.8f}, up[3] = {0, 0, 1};
         memset(&g, 0, sizeof g);
         for (i = 0; i < 100000; ++i)
-            gkdi_signature_add(&g, p, i % 2000 ? up : dir, i % 1000 ? 0.0f : 1.0f);
+            add_sample(&g, p, i % 2000 ? up : dir, i % 1000 ? 0.0f : 1.0f);
         memset(&l, 0, sizeof l);
         for (i = 0; i < 1000; ++i)
-            gkdi_signature_add(&l, p, dir, i ? 0.0f : 1.0f);
+            add_sample(&l, p, dir, i ? 0.0f : 1.0f);
         merge_signature(&g, &l);
         CHECK(gkdi_compare(&t[0], &g, NULL, &l) == 0, "one sample");
         CHECK(gkdi_compare(&t[1], &g, NULL, &l) == 2, "the paper's test has changed");
         memset(&l, 0, sizeof l);
         for (i = 0; i < 1000; ++i)
-            gkdi_signature_add(&l, p, dir, 0);
+            add_sample(&l, p, dir, 0);
         merge_signature(&g, &l);
         CHECK(gkdi_compare(&t[0], &g, NULL, &l) == 0, "no sample");
         CHECK(gkdi_compare(&t[1], &g, NULL, &l) == 1, "the paper's test has changed");
@@ -1139,6 +1295,7 @@ static void sums_do_not_drift(void **state)
     failures = 0;
     rng = 3;
     test_sums();
+    test_drift();
     assert_int_equal(failures, 0);
 }
 
@@ -1196,6 +1353,15 @@ static void published_formulas_are_word_for_word(void **state)
     assert_int_equal(failures, 0);
 }
 
+static void batches_are_their_samples(void **state)
+{
+    (void)state;
+    failures = 0;
+    rng = 14;
+    test_batches();
+    assert_int_equal(failures, 0);
+}
+
 static void uniform_cells_do_not_split(void **state)
 {
     (void)state;
@@ -1244,6 +1410,7 @@ int main(void)
         cmocka_unit_test(direction_test_errs_as_often_as_it_says),
         cmocka_unit_test(tests_hold_for_difficult_light),
         cmocka_unit_test(published_formulas_are_word_for_word),
+        cmocka_unit_test(batches_are_their_samples),
         cmocka_unit_test(uniform_cells_do_not_split),
         cmocka_unit_test(known_steps_split_at_the_predicted_number),
         cmocka_unit_test(other_steps_and_errors_hold),

@@ -2,7 +2,8 @@
 
    Options (--set key=value), defaults as in guide_kd.h: split=signature|count, count (non-zero samples of a cell before
    it splits), lookahead (levels), min_samples, radiance_step, direction_step (degrees), confidence,
-   criteria=both|radiance|direction, tests=own|published, keep_signatures (0 .. 1), max_levels, max_lobes,
+   criteria=both|radiance|direction, tests=own|published, keep_signatures (0 .. 1), prune=on|off (lookahead cells that
+   are surely like their cell go), rest=on|off (mixtures that no longer change are not fitted), max_levels, max_lobes,
    update_samples, max_memory_mb, learn_alpha=grid|off (on = grid), alpha, gate=on|off, gate_margin, gate_gain,
    gate_probe, uniform, simd=scalar|avx2|avx512|neon, product=on|off (with the cosine), parallax=on|off (lobes know
    distances), jitter=on|off (find looks up a jittered position), sparse=on|off (closed fields record only some tiles),
@@ -46,6 +47,8 @@ static bool parse(parser *p, gkd_desc *d, kd *m)
     d->no_direction_test = criteria == 1;
     d->published_tests = choice(p, "tests", "own|published") == 1;
     d->keep_signatures = (float)number(p, "keep_signatures", 0);
+    d->no_prune = choice(p, "prune", "off|on") == 0;
+    d->no_rest = choice(p, "rest", "off|on") == 0;
     d->max_levels = (uint32_t)number(p, "max_levels", 0);
     d->max_lobes = (uint32_t)number(p, "max_lobes", 0);
     d->update_samples = (uint32_t)number(p, "update_samples", 0);
@@ -280,15 +283,17 @@ static void kd_stats(void *method, tr_method_stats *stats)
     snprintf(stats->json, sizeof stats->json,
              "\"passes\": %u, \"updates\": %u, \"zeros\": %llu, \"rejected\": %llu, \"clamped\": %llu, \"lost\": %llu, "
              "\"levels\": %u, \"lookahead_cells\": %llu, \"lobes\": %llu, \"radiance_splits\": %llu, "
-             "\"direction_splits\": %llu, \"denied_splits\": %llu, \"fits\": %llu, \"open_cells\": %u, "
+             "\"direction_splits\": %llu, \"denied_splits\": %llu, \"fits\": %llu, \"rests\": %llu, \"alike\": %llu, "
+             "\"open_cells\": %u, "
              "\"closed_cells\": %u, \"unjudged_cells\": %u, \"opened\": %llu, \"closed\": %llu, \"probed\": %llu, "
              "\"closed_share\": %.4f, \"mean_alpha\": %.4f, \"record_fraction\": %.4f",
              s.passes, s.updates, (unsigned long long)s.zeros, (unsigned long long)s.rejected,
              (unsigned long long)s.clamped, (unsigned long long)s.lost, s.levels, (unsigned long long)s.lookahead,
              (unsigned long long)s.lobes, (unsigned long long)s.radiance_splits, (unsigned long long)s.direction_splits,
-             (unsigned long long)s.denied_splits, (unsigned long long)s.fits, s.open_cells, s.closed_cells,
-             s.unjudged_cells, (unsigned long long)s.opened, (unsigned long long)s.closed, (unsigned long long)s.probed,
-             (double)s.closed_share, (double)s.mean_alpha, (double)gkd_record_fraction(m->field));
+             (unsigned long long)s.denied_splits, (unsigned long long)s.fits, (unsigned long long)s.rests,
+             (unsigned long long)s.alike, s.open_cells, s.closed_cells, s.unjudged_cells, (unsigned long long)s.opened,
+             (unsigned long long)s.closed, (unsigned long long)s.probed, (double)s.closed_share, (double)s.mean_alpha,
+             (double)gkd_record_fraction(m->field));
     if (m->structure) {
         size_t n = strlen(stats->json);
         gkd_get_stats(m->structure, &s);
