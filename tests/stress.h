@@ -206,7 +206,7 @@ static float any_pdf(stress *s, const recipe *r)
     return r->pdf == 2 && stress_chance(s, 0.1) ? hostile_number(s) : (float)(1 / (4 * PI));
 }
 
-static float any_distance(stress *s, bool hostile)
+static inline float any_distance(stress *s, bool hostile)
 {
     if (hostile && stress_chance(s, 0.1))
         return hostile_number(s);
