@@ -58,7 +58,7 @@
        count       when it has seen desc.split_samples non-zero samples.
      Where both halves of a lookahead cell are like their cell with confidence (the same tests, turned round: surely
      less than radiance_step and direction_step away), and so is all that was below, nothing is kept below it until it
-     differs or has twice the samples.
+     differs or its samples pass twice to four times those.
      After a split the lookahead cells of both halves start anew from the samples of the current update, and each half
      is looked at again, so that one update can split many times. Mixtures are inherited, seen from the new pivots.
 
@@ -66,7 +66,7 @@
      every desc.update_samples samples and in refine: signatures, splits, and a few steps of weighted EM on each
      cell's mixture. A mixture that no longer changes rests until its cell has seen twice the samples [after Zheng 2025,
      section 7.5]: it has moved by less than 0.005 nats per share of new samples. Of all samples of a cell a quarter
-   counts, earlier ones fade: they were drawn with worse guides. What queries see changes in refine only.
+     counts, earlier ones fade: they were drawn with worse guides. What queries see changes in refine only.
 
      Parallax: each lobe knows how far away that is what it shows. gkd_find turns every lobe to the position that asks
      [Ruppert 2020]. With a normal, lobes are multiplied by the cosine, and what lies below the surface is mirrored up:
@@ -1578,11 +1578,10 @@ static double gkdi_least_angle(const gkdi_split_tests *t, double spread)
 /* ---- >>compare ---------------------------------------------------------------------------------------------- */
 
 /* By how much a lookahead cell's mean radiance lies farther than T above (sign 1) or below (-1) the cell's, and the
-   standard error of that: does it differ? [Zheng 2025, Appendix A], divided by
-   N_g; "rest" is the cell without the lookahead cell. Own: 1. A score test. Both variances are at least what they are
-   if all samples have the same relative variance and the lookahead cell's mean is (1 -+ T) times the cell's, the edge
-   of the null hypothesis. A lookahead cell that rare bright samples have missed so far sees neither them nor the
-   variance that they make; the cell does.
+   standard error of that [Zheng 2025, Appendix A], divided by N_g; "rest" is the cell without the lookahead cell.
+   Own: 1. A score test. Both variances are at least what they are if all samples have the same relative variance and
+   the lookahead cell's mean is (1 -+ T) times the cell's, the edge of the null hypothesis. A lookahead cell that rare
+   bright samples have missed so far sees neither them nor the variance that they make; the cell does.
    2. N_l / N_g is random too: adds (1 -+ T)^2 f (1 - f) (difference of the two means)^2 / N_g. */
 static double gkdi_radiance_excess(const gkdi_split_tests *t, const gkd_signature *g, const gkd_signature *l, int sign,
                                    double *error)
@@ -1656,7 +1655,7 @@ typedef struct gkdi_plane {
 /* Variance of q . w, w = a part's sum of L * direction, q in the plane; n, sum and squares are its b0, b1, b2 (own).
    It is the sum of L^2 (q . direction)^2. Of a lookahead cell only the sum of L^2 is known; the shape is taken from the
    cell, turned to the part's mean direction, and widened if the part is wider than the cell as to their means of L *
-   direction. Relative noise is at least the whole cell's: as in gkdi_radiance_differs. */
+   direction. Relative noise is at least the whole cell's: as in gkdi_radiance_excess. */
 static double gkdi_part_variance(const gkd_signature *g, const gkdi_shape *shape, const gkdi_plane *p, double n,
                                  double sum, double squares, const double w[3], const double q[3])
 {
@@ -3441,14 +3440,16 @@ static void gkdi_look_pack(gkdi_cell *c, const unsigned char *used)
 
 /* Give up the children of lookahead cells of which both are surely like the cell, from the last level up, so that
    nothing is given up of which the parts were not seen. Those about them stay and are asked again at every update; when
-   they differ, or have about doubled their samples (alike holds log2 of these), they grow again: light may have changed
-   in a small part of them. Returns how many were given up. */
+   they differ, or their samples pass the power of two that `alike` holds the exponent of, twice to four times those at
+   which they were given up, they grow again: light may have changed in a small part of them. Returns how many were
+   given up. */
 static uint32_t gkdi_look_prune(const gkd_field *field, gkdi_cell *c)
 {
     const gkd_desc *desc = &field->desc;
     unsigned char level[GKDI_MAX_LOOK], used[GKDI_MAX_LOOK];
     uint32_t i, k, gone = 0;
     memset(used, 1, sizeof used);
+    memset(level, 0, sizeof level);
     for (i = level[0] = 0; i < c->look_count; ++i) /* children come after their parents */
         for (k = 0; k < 2 && c->look[i].child; ++k)
             level[c->look[i].child + k] = (unsigned char)(level[i] + 1);
@@ -3460,18 +3461,22 @@ static uint32_t gkdi_look_prune(const gkd_field *field, gkdi_cell *c)
             used[s->child] = used[s->child + 1] = 0;
             gone += 2;
             s->child = 0;
-            s->alike = (uint8_t)doubled;
+            s->alike = (uint8_t)(doubled + 1);
         }
         if (s->child || (!s->alike && level[i] < gkdi_look_levels(desc)))
             continue;
         same = gkdi_alike(&field->tests, &c->look[0], &c->shape, s, !desc->no_radiance_test, !desc->no_direction_test);
         if (level[i] < gkdi_look_levels(desc))
-            same = same && s->alike == doubled;
-        s->alike = (uint8_t)(same ? doubled : 0);
+            s->alike = (uint8_t)(same && s->alike >= doubled ? s->alike : 0);
+        else
+            s->alike = (uint8_t)(same ? doubled : 0);
     }
     if (gone) {
+        uint32_t room;
         gkdi_look_pack(c, used);
-        gkdi_look_resize(desc, c, gkdi_look_room(desc, c->look_count)); /* or it stays large */
+        room = gkdi_look_room(desc, c->look_count);
+        if (room < c->look_capacity)         /* growing is for updates, which count bytes */
+            gkdi_look_resize(desc, c, room); /* or it stays large */
     }
     return gone;
 }
@@ -3853,7 +3858,7 @@ static void gkdi_update_cell(const gkdi_update *u, gkdi_outcome *o, gkdi_cell_sa
             return;
         gkdi_outcome_free(desc, o);
         o->denied++;
-    } else if (desc->split == GKD_SPLIT_SIGNATURE && !desc->no_prune)
+    } else if (desc->split == GKD_SPLIT_SIGNATURE && !desc->no_prune && !desc->published_tests)
         o->alike += gkdi_look_prune(field, c);
     gkdi_fit_cell(field, o, c, batch->items, range[1]);
 }
@@ -5923,7 +5928,8 @@ static bool gkdi_look_valid(const gkdi_cell *c, uint32_t most)
     for (i = 0; i < c->look_count; ++i) {
         const gkd_signature *s = &c->look[i];
         uint32_t child = s->child;
-        if (!gkdi_signature_valid(s) || s->axis > 2 || (child && (child + 1 >= c->look_count || child <= i)))
+        if (!gkdi_signature_valid(s) || s->axis > 2 ||
+            (child && (s->alike || child + 1 >= c->look_count || child <= i)))
             return false;
         next += child ? 2 : 0;
     }

@@ -190,11 +190,11 @@ typedef enum gph_alpha_mode {
 /* Zero-initialise it; zero means the default. Fields named no_x switch a default behaviour off. */
 typedef struct gph_desc {
     float bounds_min[3], bounds_max[3]; /* world-space box of the grid; all zero: from the first camera vertices */
-    uint32_t grid_cells;                /* r_init, cubes along the box's longest side, 1 .. 1024; default 100 */
-    uint32_t rows;                      /* of a histogram, 16, 32 or 64; columns are twice as many; default 32 */
-    float split_photons;                /* c of the split rule, 16 .. 1e9; default 500 */
-    uint32_t max_levels;                /* of a cube's tree, 1 .. 24; default 18 */
-    uint32_t keep_passes;               /* passes that an unread voxel is kept, 1 .. 1000; default 4 */
+    uint32_t grid_cells;     /* r_init, cubes along the box's longest side, 1 .. 1024; default 25 (the paper: 100) */
+    uint32_t rows;           /* of a histogram, 16, 32 or 64; columns are twice as many; default 32 */
+    float split_photons;     /* c of the split rule, 16 .. 1e9; default 500 */
+    uint32_t max_levels;     /* of a cube's tree, 1 .. 24; default 18 */
+    uint32_t keep_passes;    /* passes that an unread voxel is kept, 1 .. 1000; default 4 */
     uint32_t cloud_photons;  /* of the first pass that are kept for median splits, 1024 .. 2^28; default 2^21 */
     uint64_t max_bytes;      /* memory cap, see MEMORY; >= 2^20; default 2^30 */
     gph_repair repair;       /* of histograms before they are sampled */
@@ -2728,7 +2728,7 @@ GPH_API gph_result gph_resolve(const gph_desc *desc, gph_desc *resolved)
         d.allocate = gphi_default_allocate;
         d.release = gphi_default_release;
     }
-    gphi_default_u32(&d.grid_cells, 100);
+    gphi_default_u32(&d.grid_cells, 25);
     gphi_default_u32(&d.rows, 32);
     gphi_default_float(&d.split_photons, 500);
     gphi_default_u32(&d.max_levels, 18);

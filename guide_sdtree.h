@@ -62,7 +62,8 @@
      quadtree: bright light, for which it matters, decides. A quadtree of few far lights so stays sharp in a large cell
      [in place of the distance of every lobe, Ruppert 2020]. The pivot is the middle of the cell; parts of it keep it
      while all of them lie within 0.6 radii of it and nearness has not changed by a factor of two, since sums are seen
-     from there. The even share is even as seen from the place. Distances of INFINITY: no parallax.
+     from there. The even share is even as seen from the place. Places beyond 0.8 radii, which only jitter and positions
+     outside the bounds lead to, are taken for those at 0.8. Distances of INFINITY: no parallax; forests have none.
 
      What is learned (desc.target); p = pdf_mix, the density the direction was drawn with:
        radiance        mass of a leaf = sum of L / p                                              [Mueller 2017]
@@ -106,23 +107,23 @@
      moment, and enough of the pixel's noise to be worth its time. Samples of a pass judge the tree built from earlier
      passes. Since no guide has V(a) < m^2, a cell with V(1) < m^2 + gate_gain / W^2 closes whatever its tree, though
      not before eight rebuilds: light that is rare must have had the time to be found. Verdicts need 95 % confidence and
-   many non-zero samples: cells whose light is rarely found stay open. Closed cells are tried again every gate_probe
-   passes and need more to open than to close. Cells without verdict guide. Without a pixel estimate
-   (gsd_pass.pixel_estimate) 1 / W^2 = 16 m^2.
+     many non-zero samples: cells whose light is rarely found stay open. Closed cells are tried again every gate_probe
+     passes and need more to open than to close. Cells without verdict guide. Without a pixel estimate
+     (gsd_pass.pixel_estimate) 1 / W^2 = 16 m^2.
 
    THE SAMPLE
      One per non-delta path vertex whose direction was traced. radiance L: from that direction, no cosine, no BSDF, not
      divided by a pdf; light that next-event estimation can sample weighted by its MIS weight; connections of this
      vertex not included. Zeros count: record them. distance: to the next vertex, INFINITY = the environment or not
      known. gsd_make_sample fills one from RGB arrays; the normal is the one that gsd_find got. A direction rejected
-   before tracing (f = 0) has radiance GSD_REJECTED (-0.0f): it counts as a visit and as a zero for the second-moment
-   targets and the gate. pdf_guide = 0 means "not evaluated"; the field evaluates it where it needs it. A vertex that
-   was recorded counts as a read of its cell; cells without new samples are left alone by refine.
+     before tracing (f = 0) has radiance GSD_REJECTED (-0.0f): it counts as a visit and as a zero for the second-moment
+     targets and the gate. pdf_guide = 0 means "not evaluated"; the field evaluates it where it needs it. A vertex that
+     was recorded counts as a read of its cell; cells without new samples are left alone by refine.
 
    OPTIONS: see gsd_desc. gsd_resolve fills in defaults, gsd_get_desc returns what a field uses.
 
    MEMORY
-     Sampling part: 16 bytes per quadtree node, 56 per cell, 32 per quadtree, 512 per learned quadtree (bins of
+     Sampling part: 16 bytes per quadtree node, 64 per cell, 32 per quadtree, 512 per learned quadtree (bins of
      directions: skip three levels, carry the cosine), 12 per leaf with desc.alias, 4 per spatial node, and 16 KB.
      Building part: 20 bytes per quadtree node, sizeof(gsd_cell_state) (below 600) per cell.
      max_bytes bounds the peak of both parts while refine runs, old and new together: trees coarsen and cells stop
@@ -146,17 +147,18 @@
      gsd_result, 0 = ok; gsd_result_string says which field to change. Asserts (GSD_ASSERT) catch programming errors.
      Bad samples (NaN, infinity, negative, >= 1e30, pdf_mix <= 0, zero direction, distance <= 0 or NaN) are refused and
      counted in gsd_stats; positions outside the bounds are clamped and counted. A failed allocation leaves the field as
-   it was before the call, except that accumulate has lost the samples it was given (counted). gsd_load checks size,
-   version, byte order, checksum and every index before use.
+     it was before the call, except that accumulate has lost the samples it was given (counted). gsd_load checks size,
+     version, byte order, checksum and every index before use.
 
    NUMERICAL LIMITS
      Quadtree depth <= 20 (default 16). Directions are quantised to 24 bits an axis; u is read to 24 bits and 8 more are
      filled with a hash of u, so that small leaves are covered densely. A float direction can land in a neighbour leaf
      after rounding (depth 20: 2 %, depth 12: 0.006 %): gsd_sample returns the density of the rounded direction, the
-     same as gsd_pdf for it. phi is computed to 4e-8 rad. SIMD levels differ from scalar by <= 2e-6 relative, and by the
-     neighbour's density for about 1e-6 of directions within rounding of a leaf's edge. accumulate and refine use one
-     code path for all levels, but for the matrices of GSD_DENOISE_GAUSSIAN: they differ by <= 1e-6 relative, so that a
-     node within that of the threshold is divided at one level and not at another.
+     same as gsd_pdf for it, but for some 4e-6 of directions near the poles of trees of depth 20 with parallax. phi is
+   computed to 4e-8 rad. SIMD levels differ from scalar by <= 2e-6 relative (4e-6 with parallax), and by the neighbour's
+   density for about 1e-6 of directions within rounding of a leaf's edge. accumulate and refine use one code path for
+   all levels, but for the matrices of GSD_DENOISE_GAUSSIAN: they differ by <= 1e-6 relative, so that a node within that
+   of the threshold is divided at one level and not at another.
 
    REFERENCES
      T. Mueller, M. Gross, J. Novak 2017, Practical Path Guiding for Efficient Light-Transport Simulation.
@@ -396,7 +398,7 @@ typedef struct gsd_alias {
     uint32_t node, other;
 } gsd_alias;
 
-/* 56 bytes: what a query knows about a cell. */
+/* 64 bytes, a cache line: what a query knows about a cell. */
 typedef struct gsd_cell {
     uint32_t root;        /* node of its quadtree; 0 = uniform */
     uint32_t jump;        /* into the table of jumps; 0 = none */
@@ -410,6 +412,7 @@ typedef struct gsd_cell {
     uint32_t depth;  /* of the deepest leaf of its quadtree */
     float pivot[3];  /* where its quadtree is seen from */
     float nearness;  /* 1 / radius of the sphere around it on which the quadtree lies; 0 = infinitely large */
+    uint32_t reserved[2];
 } gsd_cell;
 enum { GSD_GATE_UNJUDGED, GSD_GATE_OPEN, GSD_GATE_CLOSED };
 
@@ -503,7 +506,7 @@ GSD_API gsd_result gsd_save(const gsd_field *field, void *data, size_t capacity,
    aligned and may come from an untrusted source. *field = NULL on failure. [any thread] */
 GSD_API gsd_result gsd_load(const gsd_desc *desc, const void *data, size_t size, gsd_field **field);
 
-/* Equal for fields whose building parts have the same cells and quadtrees. Changes in refine. [any thread] */
+/* Equal for fields whose building parts have the same cells, pivots and quadtrees. Changes in refine. [any thread] */
 GSD_API uint64_t gsd_structure_id(const gsd_field *field);
 /* Add source's building sums (since the last refine) to field's; GSD_MISMATCH unless their structure ids are equal.
    [exclusive] on field, source is only read. */
@@ -511,7 +514,7 @@ GSD_API gsd_result gsd_merge(gsd_field *field, const gsd_field *source);
 
 /* One quadtree as plain arrays: for each inner node (a tree that is one leaf has one inner node with four equal leaves)
    child[4]: index of an inner node, 0 = leaf; value[4]: mass of each child. Node 0 is the root; children come later
-   than parents. Child number as in gsd_node. */
+   than parents. Child number as in gsd_node. Directions are those from the cell's pivot (gsd_view.cells). */
 typedef struct gsd_tree {
     uint32_t cell;
     uint32_t count;  /* inner nodes */
@@ -610,7 +613,8 @@ GSD_QUERY uint32_t gsd_leaf_at(const gsd_view *view, const gsd_handle *handle, u
     return node;
 }
 
-/* The cell as a handle. cell < view->cell_count; larger ones give the uniform density. For forests. [any thread] */
+/* The cell as a handle, seen from its pivot (from elsewhere: gsd_offset, before gsd_orient). cell < view->cell_count;
+   larger ones give the uniform density. For forests. [any thread] */
 GSD_QUERY gsd_handle gsd_find_cell(const gsd_view *view, uint32_t cell)
 {
     gsd_handle handle = {0, 0, 0, 0, 0, 1.0f, 0, {0, 0, 0}, 0, {0, 0, 0}};
@@ -1149,7 +1153,7 @@ typedef struct gsdi_state {
     double weight;                 /* sum of contribution / p */
     double pixel, pixel_v;         /* sum of x_1 (pixel contribution / contribution)^2, and of x_1 beside it */
     double flow;                   /* sum of contribution / p of this pass */
-    double mass, near_mass;        /* sum of what went into the quadtree, and of that times 1 / distance */
+    double mass, near_mass;        /* what its samples put into quadtrees, and the sum of that times 1 / distance */
     float theta, moment1, moment2; /* Adam: alpha = sigmoid(theta) */
     uint32_t steps;
     float alpha;    /* learned; what queries see is in gsd_cell */
@@ -2748,10 +2752,15 @@ static void gsdi_prepare(void *context, uint32_t begin, uint32_t end)
             item->pdf_mix = s->pdf_mix;
             item->pdf_bsdf = s->pdf_bsdf;
             item->pdf_guide = s->pdf_guide;
-            if (item->contribution > 0 || item->value > 0)
-                gsdi_see(a, s, at, item);
+            GSDI_PREFETCH(&a->field->states[a->target_cell[at]].pivot);
             segment->rejected += rejected;
             segment->zeros += !(s->radiance > 0) || !(s->contribution > 0);
+        }
+        for (i = 0; i < segment->count; ++i) { /* apart, so that memory has had time */
+            uint32_t at = segment->base + i;
+            gsdi_item *item = &a->items[at];
+            if (a->read_cell[at] != GSDI_NONE && (item->contribution > 0 || item->value > 0))
+                gsdi_see(a, &segment->samples[i], at, item);
         }
     }
 }
@@ -4087,6 +4096,7 @@ static void gsdi_cell_write(gsdi_block *b, const gsdi_tree *trees, gsd_cell *cel
     cell->reflected = s->reflected;
     cell->depth = t->max_depth;
     cell->pivot[0] = cell->pivot[1] = cell->pivot[2] = cell->nearness = 0; /* the caller knows better */
+    cell->reserved[0] = cell->reserved[1] = 0;
     cell->alpha = t->groups == 0 || s->gate == GSD_GATE_CLOSED ? 1.0f : s->alpha;
 }
 
@@ -4095,16 +4105,19 @@ static void gsdi_choose_pivot(const gsdi_block *b, gsdi_state *s)
 {
     double size = 1 / (double)b->scale, radius = 0, reach = 0, middle[3];
     double nearness = s->mass > 0 ? s->near_mass / s->mass : 0, now = (double)s->nearness;
+    bool own = true;
     uint32_t axis;
     for (axis = 0; axis < 3; ++axis) {
         double half = 0.5 * (double)gsd_cell_extent(s->level, axis) * size, far;
         middle[axis] = (double)b->origin[axis] + (double)s->origin[axis] * size + half;
         far = fabs(middle[axis] - (double)s->pivot[axis]) + half;
+        own = own && (float)middle[axis] == s->pivot[axis];
         radius += half * half;
         reach += far * far;
     }
     nearness = fmin(nearness, GSDI_MOST_REACH / sqrt(radius));
-    if (now > 0 && sqrt(reach) * now < GSDI_KEPT_REACH && nearness < 2 * now && now < 2 * nearness)
+    if (now > 0 && sqrt(reach) * now < (own ? 1.0001 * GSDI_MOST_REACH : GSDI_KEPT_REACH) && nearness < 2 * now &&
+        now < 2 * nearness)
         return;
     for (axis = 0; axis < 3; ++axis)
         s->pivot[axis] = (float)middle[axis];
@@ -4143,10 +4156,10 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
                                  r->child + p->first, r->sum + p->first);
             s->held = old->held * keep;
             s->lit = old->lit * keep;
+            if (!r->desc->forest_cells)
+                gsdi_choose_pivot(r->block, s); /* before its mass fades, perhaps to nothing */
             s->mass *= r->keep;
             s->near_mass *= r->keep;
-            if (!r->desc->forest_cells)
-                gsdi_choose_pivot(r->block, s);
             s->rebuilds = old->rebuilds < 1000000u ? old->rebuilds + 1 : old->rebuilds;
             for (k = 0; k < 64; ++k)
                 s->bins[k] = p->level == old->level ? (uint32_t)((double)old->bins[k] * r->keep) : 0;
@@ -4162,7 +4175,7 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
         s->hits = 0;
         gsdi_cell_write(r->block, r->trees, cell, s, job->tree);
         memcpy(cell->pivot, job->rebuild ? old->pivot : was->pivot, sizeof cell->pivot);
-        cell->nearness = job->rebuild ? old->nearness : was->nearness;
+        cell->nearness = cell->root == 0 ? 0 : job->rebuild ? old->nearness : was->nearness;
     }
 }
 
@@ -6069,7 +6082,7 @@ GSD_API gsd_result gsd_import_trees(gsd_field *field, const gsd_tree *trees, uin
         }
         gsdi_cell_write(r.block, r.trees, &gsdi_cells(r.block)[i], &field->states[i], job->tree);
         memcpy(gsdi_cells(r.block)[i].pivot, gsdi_cells(old)[i].pivot, 3 * sizeof(float));
-        gsdi_cells(r.block)[i].nearness = gsdi_cells(old)[i].nearness;
+        gsdi_cells(r.block)[i].nearness = gsdi_cells(r.block)[i].root ? gsdi_cells(old)[i].nearness : 0;
     }
     memcpy((char *)r.block + r.block->trees_at, r.trees, r.tree_count * sizeof(gsdi_tree));
     gsdi_release(r.desc, field->memory);

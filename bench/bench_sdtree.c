@@ -369,9 +369,10 @@ static double time_naive(const options *o, naive_space *root, const queries *q, 
             if (what == NAIVE_FIND)
                 sum += s->cell;
             else if (what == NAIVE_SAMPLE)
-                sum += naive_sample(s->sampling, q->u_d[2 * i], q->u_d[2 * i + 1], w);
+                sum += naive_sample_at(s, &q->position_d[3 * i], q->u_d[2 * i], q->u_d[2 * i + 1], w);
             else
-                sum += naive_pdf(s->sampling, what == NAIVE_PDF ? &q->uniform_d[3 * i] : &q->guided_d[3 * i]);
+                sum += naive_pdf_at(s, &q->position_d[3 * i],
+                                    what == NAIVE_PDF ? &q->uniform_d[3 * i] : &q->guided_d[3 * i]);
         }
         bench_use(&sum);
     });
@@ -396,16 +397,18 @@ static void compare(const gsd_view *v, const queries *q, naive_space *root, bool
     for (uint32_t i = 0; i < BATCH; ++i) {
         const naive_space *s = naive_find(root, &q->position_d[3 * (at + i)]);
         m->find += r->handle[i].cell != s->cell;
-        m->pdf += differs((double)d->pdf[i], naive_pdf(s->sampling, &q->uniform_d[3 * (at + i)]));
-        m->guided += differs((double)g->pdf[i], naive_pdf(s->sampling, &q->guided_d[3 * (at + i)]));
+        const double *p = &q->position_d[3 * (at + i)];
+        m->pdf += differs((double)d->pdf[i], naive_pdf_at(s, p, &q->uniform_d[3 * (at + i)]));
+        m->guided += differs((double)g->pdf[i], naive_pdf_at(s, p, &q->guided_d[3 * (at + i)]));
     }
     (batched ? sample_batch : sample_scalar)(v, q, at, BATCH, r);
     for (uint32_t i = 0; i < BATCH; ++i) {
         const naive_space *s = naive_find(root, &q->position_d[3 * (at + i)]);
         const float *f = &r->direction[3 * i];
         double w[3], drawn[3] = {(double)f[0], (double)f[1], (double)f[2]};
-        double pdf = naive_sample(s->sampling, q->u_d[2 * (at + i)], q->u_d[2 * (at + i) + 1], w);
-        m->drawn += differs((double)r->pdf[i], naive_pdf(s->sampling, drawn));
+        const double *p = &q->position_d[3 * (at + i)];
+        double pdf = naive_sample_at(s, p, q->u_d[2 * (at + i)], q->u_d[2 * (at + i) + 1], w);
+        m->drawn += differs((double)r->pdf[i], naive_pdf_at(s, p, drawn));
         m->sample += differs((double)r->pdf[i], pdf) || sf1_dot(w, drawn) < 1 - 1e-5;
     }
     free(r);
@@ -682,6 +685,8 @@ static gsd_field *learn(const gsd_desc *desc, int log2n, uint64_t seed, learning
     check(gsd_stream_create(field, &stream), "stream");
     for (int update = 0; update < SF1_UPDATES; ++update) {
         uint32_t count = draw_samples(&rng, n, update, 0, samples), i;
+        for (i = 0; naive && i < count; ++i)
+            samples[i].nearness = 0; /* of which the naive learner knows nothing */
         fill_pdf_guide(field, samples, count);
         double time = bench_seconds();
         for (i = 0; i < count; i += 64)

@@ -141,6 +141,7 @@ typedef struct naive_space {
     naive_node *building, *sampling;
     uint32_t cell;
     uint64_t samples;
+    double pivot[3], nearness; /* the box is a unit cube */
 } naive_space;
 
 static inline void naive_free_space(naive_space *s)
@@ -164,6 +165,45 @@ static inline naive_space *naive_find(naive_space *s, const double *position)
         s = s->child[upper];
     }
     return s;
+}
+
+/* Position relative to the pivot, as gsd_offset. */
+static inline void naive_offset(const naive_space *s, const double *position, double *o)
+{
+    double l = 0;
+    for (int k = 0; k < 3; ++k) {
+        o[k] = (position[k] - s->pivot[k]) * s->nearness;
+        l += o[k] * o[k];
+    }
+    for (int k = 0; k < 3 && l > 0.64; ++k)
+        o[k] *= 0.8 / sqrt(l);
+}
+
+/* Density at a position: of the point of the sphere, by the solid angle there per solid angle here. */
+static inline double naive_pdf_at(const naive_space *s, const double *position, const double *w)
+{
+    double o[3], seen[3], even = NAIVE_UNIFORM / (4 * NAIVE_PI), b, t, root;
+    naive_offset(s, position, o);
+    b = o[0] * w[0] + o[1] * w[1] + o[2] * w[2];
+    root = sqrt(1 - (o[0] * o[0] + o[1] * o[1] + o[2] * o[2]) + b * b);
+    t = root - b;
+    for (int k = 0; k < 3; ++k)
+        seen[k] = o[k] + t * w[k];
+    return (naive_pdf(s->sampling, seen) - even) * t * t / root + even;
+}
+
+static inline double naive_sample_at(const naive_space *s, const double *position, double r0, double r1, double *w)
+{
+    double o[3], l = 0;
+    naive_sample(s->sampling, r0, r1, w);
+    naive_offset(s, position, o);
+    for (int k = 0; k < 3 && !(r0 < NAIVE_UNIFORM); ++k) { /* the even share is even as seen from here */
+        w[k] -= o[k];
+        l += w[k] * w[k];
+    }
+    for (int k = 0; k < 3 && l > 0; ++k)
+        w[k] /= sqrt(l);
+    return naive_pdf_at(s, position, w);
 }
 
 static inline naive_node *naive_import(const gsd_tree *tree, uint32_t node)
@@ -193,6 +233,9 @@ static inline naive_space *naive_copy_field(const gsd_field *field, const gsd_vi
         return s;
     }
     s->cell = cell;
+    for (int k = 0; k < 3; ++k)
+        s->pivot[k] = ((double)view->cells[cell].pivot[k] - (double)view->origin[k]) * (double)view->scale * 0x1p-24;
+    s->nearness = (double)view->cells[cell].nearness / (double)view->scale * 0x1p24;
     gsd_tree tree = {0, 0, NULL, NULL};
     tree.cell = cell;
     tree.count = gsd_export_bound(field, GSD_PART_SAMPLING, cell);
