@@ -65,9 +65,9 @@
    OPTIONS: see gnn_unet_desc. gnn_unet_resolve fills in defaults, gnn_unet_get_desc returns what a network uses.
 
    MEMORY
-     A network holds its weights, and 2 to 6 times that prepared for kernels; with desc.training three times more.
+     A network holds its weights, and 2 to 5 times that prepared for kernels; with desc.training three times more.
      Running and training allocate nothing: the caller gives a workspace of gnn_unet_workspace bytes. gnn_unet_load,
-     gnn_unet_bound and gnn_unet_save allocate for the time of the call. Stack: below 4 KB per call.
+     gnn_unet_bound and gnn_unet_save allocate for the time of the call. Stack: below 8 KB per call.
 
    THREADS: each function has a tag.
      [any thread]   pure function on constant data and on what the caller hands it for this call alone
@@ -124,14 +124,14 @@ extern "C" {
 #define GNN_RESULTS(X)                                                                                                 \
     X(GNN_OK, "ok")                                                                                                    \
     X(GNN_OUT_OF_MEMORY, "out of memory: check desc.allocate")                                                         \
-    X(GNN_BAD_OPTION, "desc.simd is out of range or not available on this machine")                                    \
+    X(GNN_BAD_OPTION, "desc.simd is not a level that this machine has, or desc.training is not set")                   \
     X(GNN_BAD_RANGE, "a number in the descriptor is out of its range: see its comments")                               \
     X(GNN_BAD_SHAPE, "width and height do not fit: see the comment of gnn_conv or gnn_unet_desc")                      \
     X(GNN_BAD_ALLOCATOR, "set both desc.allocate and desc.release or neither")                                         \
     X(GNN_BUFFER_TOO_SMALL, "the buffer or workspace is too small: ask the function that tells its size")              \
     X(GNN_BAD_FILE, "not a safetensors file, or it is damaged")                                                        \
     X(GNN_MISSING_TENSOR, "the file lacks a tensor that the network needs")                                            \
-    X(GNN_WRONG_TENSOR, "a tensor has another shape or type than the network needs, or a value that is not finite")
+    X(GNN_WRONG_TENSOR, "a tensor does not fit the network, or has values that are not finite or too large for F16")
 
 #define GNN_RESULT_ENUM(name, text) name,
 typedef enum gnn_result { GNN_RESULTS(GNN_RESULT_ENUM) GNN_RESULT_COUNT } gnn_result;
@@ -175,15 +175,17 @@ typedef struct gnn_message {
 
 /* [any thread] Reads the header of a safetensors file in memory and checks all of it: JSON, types, shapes, that the
    tensors' bytes follow each other without gap or overlap up to the file's end, that names are unique and free of
-   escapes. Safe for untrusted input. On success tensors[0 .. *count - 1] are sorted by name. capacity: of `tensors`;
-   too small gives GNN_BUFFER_TOO_SMALL and the number needed in *count (tensors may be NULL if capacity is 0).
-   message may be NULL. Time O(size of header + n log n). */
+   escapes. Not checked: that strings are UTF-8, that keys of the metadata are unique (the first counts). Safe for
+   untrusted input. On success tensors[0 .. *count - 1] are sorted by name. capacity: of `tensors`; too small gives
+   GNN_BUFFER_TOO_SMALL and the number needed in *count (tensors may be NULL if capacity is 0). message may be NULL.
+   Time O(size of header + n log n). */
 GNN_API gnn_result gnn_tensors_read(const void *file, size_t size, gnn_tensor *tensors, uint32_t capacity,
                                     uint32_t *count, gnn_message *message);
 /* [any thread] The tensor of that name in a list sorted by gnn_tensors_read; NULL where there is none. */
 GNN_API const gnn_tensor *gnn_tensors_find(const gnn_tensor *tensors, uint32_t count, const char *name);
 /* [any thread] The text of a key of the file's metadata, cut to capacity - 1 bytes and terminated. False where there
-   is none, or gnn_tensors_read has refused the file. Escapes are resolved, but for code points above 127: "?". */
+   is none. Escapes are resolved, but for code points above 127: "?". It reads no further than the metadata, and is safe
+   for any file: but check the file with gnn_tensors_read first. */
 GNN_API bool gnn_tensors_metadata(const void *file, size_t size, const char *key, char *text, size_t capacity);
 /* [any thread] Values begin .. begin + count - 1 of an F32 or F16 tensor as floats. False where the tensor has another
    type or fewer values. */
@@ -198,8 +200,9 @@ typedef struct gnn_weight {
     gnn_type type;       /* in the file: F32 or F16 (rounded to nearest even, beyond 65504 to infinity) */
 } gnn_weight;
 
-/* [any thread] Bytes of the file that gnn_tensors_write makes; 0 where a name, key, shape or type is not allowed.
-   metadata: pairs of key, text (printable ASCII), NULL at the end; or NULL. */
+/* [any thread] Bytes of the file that gnn_tensors_write makes; 0 where a name, key, shape or type is not allowed, or a
+   name or key is there twice. metadata: pairs of key, text (printable ASCII), NULL at the end; or NULL. Time
+   O(count^2). */
 GNN_API size_t gnn_tensors_bound(const gnn_weight *weights, uint32_t count, const char *const *metadata);
 /* [any thread] Writes a safetensors file, tensors in the order given, to buffer; *written tells its size. */
 GNN_API gnn_result gnn_tensors_write(const gnn_weight *weights, uint32_t count, const char *const *metadata,
@@ -232,14 +235,14 @@ GNN_API void gnn_map_to_planes(const float *map, uint32_t width, uint32_t height
                       + [scale[y][x] > 0] bias[o] + add[y][x][o]),   f = max(., 0) if relu, else itself
    scale: see gnn_mask_grow; NULL = 1. add: a residual; NULL = 0. width must be even, of a multiple of 4 if up > 0. */
 typedef struct gnn_conv {
-    uint32_t width, height;   /* of the output; 2 .. 4096, 1 .. 4096 */
-    uint32_t up, up_stride;   /* channels of the map of half the size, 0 = none; its floats a pixel */
-    uint32_t in, in_stride;   /* channels of the map of full size, 0 = none; its floats a pixel (any number >= in) */
+    uint32_t width, height; /* of the output; 2 .. 4096, 1 .. 4096 */
+    uint32_t up, up_stride; /* channels of the map of half the size, 0 = none; its floats a pixel */
+    uint32_t in, in_stride; /* channels of the map of full size, 0 = none; its floats a pixel, a multiple of 8 >= in */
     uint32_t out, out_stride; /* gnn_stride(out) */
     bool relu;
-    gnn_simd simd;    /* resolved, see gnn_resolve_simd */
+    gnn_simd simd;    /* a level that this machine has, not AUTO: what gnn_resolve_simd returns */
     bool no_winograd; /* else maps of at least 8 tiles of 4x4 are convolved by Winograd's method, which needs a quarter
-                         of the multiplications and differs by <= 1e-4 of the output's rms; NaN and infinity reach
+                         of the multiplications and differs by <= 5e-5 of the output's rms; NaN and infinity reach
                          pixels of the same tiles then */
 } gnn_conv;
 
@@ -253,7 +256,7 @@ typedef struct gnn_conv_maps {
 
 /* Weights are stored as floats w_up[3][3][up_stride][out_stride], w_in[3][3][in_stride][out_stride], bias[out_stride];
    those beyond up, in, out are 0 (and their gradients are). */
-/* [any thread] GNN_BAD_SHAPE, GNN_BAD_RANGE or GNN_OK. */
+/* [any thread] GNN_BAD_SHAPE, GNN_BAD_RANGE, GNN_BAD_OPTION (simd) or GNN_OK. */
 GNN_API gnn_result gnn_conv_check(const gnn_conv *conv);
 /* [any thread] Floats of the weights, of what gnn_conv_prepare derives from them, and of a call's scratch. */
 GNN_API size_t gnn_conv_weights(const gnn_conv *conv);
@@ -270,9 +273,8 @@ GNN_API void gnn_conv_forward(const gnn_conv *conv, const float *weights, const 
 /* [any thread] Gradients of a loss by what went in, from dout, its gradient by maps->out (without halo; it is
    overwritten: turned into the gradient before relu and scale). din, dup, dadd (each may be NULL) and dweights are
    added to; halos are not part of them. */
-GNN_API void gnn_conv_backward(const gnn_conv *conv, const float *weights, const float *prepared,
-                               const gnn_conv_maps *maps, float *dout, float *dup, float *din, float *dadd,
-                               float *dweights, float *scratch);
+GNN_API void gnn_conv_backward(const gnn_conv *conv, const float *prepared, const gnn_conv_maps *maps, float *dout,
+                               float *dup, float *din, float *dadd, float *dweights, float *scratch);
 
 /* [any thread] Masks [height][width] of maps without halo, 1 = valid, 0 = not. scale = 9 / (valid pixels of the 3x3
    around) and grown = 1 where there is one, both 0 elsewhere: a partial convolution is gnn_conv_forward of a map that
@@ -309,11 +311,11 @@ typedef struct gnn_unet_desc {
     uint32_t levels;                   /* 1 .. 6; default 3 */
     uint32_t channels[GNN_MAX_LEVELS]; /* of each level, 1 .. 512; default 8, 16, 32, ... */
     bool no_mask;                      /* else the last input is the mask: pixels where it is <= 0 are not valid */
-    bool training;                     /* keep what gnn_unet_train needs: two more floats a parameter */
+    bool training;                     /* keep what gnn_unet_train needs: three more floats a parameter */
     float lambda;                      /* of the loss, see gnn_loss, 1 .. 100; default 1.5 */
     float deep;         /* weight of the losses of levels below the top, 0 .. 100, -1 = 0; default 0.25 */
     float rate;         /* of Adam, 1e-8 .. 1; default 0.001 */
-    float beta1, beta2; /* of Adam, 0 .. 0.99999; default 0.9, 0.999 */
+    float beta1, beta2; /* of Adam, > 0 .. 0.99999; default 0.9, 0.999 */
     gnn_simd simd;      /* default: the best that this machine has */
     void *(*allocate)(void *user, size_t size); /* default malloc; NULL on failure; 16-byte aligned */
     void (*release)(void *user, void *pointer); /* default free; pointer may be NULL */
@@ -322,7 +324,7 @@ typedef struct gnn_unet_desc {
 
 typedef struct gnn_unet gnn_unet;
 
-/* [any thread] Fills in defaults and checks. */
+/* [any thread] Fills in defaults and checks. GNN_BAD_RANGE too where size_t cannot count the network's memory. */
 GNN_API gnn_result gnn_unet_resolve(gnn_unet_desc *desc);
 /* [any thread] All memory that the network ever takes is allocated here; weights are those of gnn_unet_seed(net, 1). */
 GNN_API gnn_result gnn_unet_create(const gnn_unet_desc *desc, gnn_unet **net);
@@ -338,7 +340,8 @@ GNN_API double gnn_unet_operations(const gnn_unet *net);
 GNN_API void gnn_unet_seed(gnn_unet *net, uint64_t seed);
 
 /* [any thread] Bytes of workspace for `maps` maps at once, to run or to train. More maps than fit at once are worked
-   on one group after the other, with the same result; a group's maps are what can run in parallel. */
+   on one group after the other, with the same result; a group's maps are what can run in parallel. SIZE_MAX where it
+   would be more than that. */
 GNN_API size_t gnn_unet_workspace(const gnn_unet *net, uint32_t maps, bool train);
 /* [any thread] (a workspace of its own for each call) inputs[count][inputs][height][width] to
    outputs[count][height][width]. Outputs can be negative. NaN and infinity in a map's input stay in that map. No
@@ -350,7 +353,8 @@ GNN_API gnn_result gnn_unet_forward(const gnn_unet *net, const float *inputs, ui
 typedef struct gnn_step {
     double loss;      /* mean over the maps that counted, of the sum over levels; 0 where none did */
     uint32_t maps;    /* that counted */
-    uint32_t refused; /* maps whose loss is above 1e6 or whose gradient is not finite: they do not count; best 0 */
+    uint32_t refused; /* maps whose loss is not below 1e6 or that have a derivative of 1e15 or more, or not finite: a
+                         square of those would stay in Adam's moments for ever. They do not count; best 0 */
 } gnn_step;
 
 /* [any thread] Mean gradient over maps by all weights, in the network's order (gnn_unet_floats of them, see
@@ -358,11 +362,12 @@ typedef struct gnn_step {
 GNN_API gnn_result gnn_unet_gradients(const gnn_unet *net, const float *inputs, const float *truths, uint32_t count,
                                       float *gradients, gnn_step *step, void *workspace, size_t size,
                                       gnn_parallel_fn parallel, void *parallel_user);
-/* [exclusive] gnn_unet_gradients, then one step of Adam (none if no map counted). desc.training must be set. */
+/* [exclusive] gnn_unet_gradients, then one step of Adam (none if no map counted). GNN_BAD_OPTION where
+   desc.training is not set. */
 GNN_API gnn_result gnn_unet_train(gnn_unet *net, const float *inputs, const float *truths, uint32_t count,
                                   gnn_step *step, void *workspace, size_t size, gnn_parallel_fn parallel,
                                   void *parallel_user);
-/* [exclusive] The learning rate from now on. */
+/* [exclusive] The learning rate from now on, 1e-8 .. 1. */
 GNN_API void gnn_unet_set_rate(gnn_unet *net, float rate);
 
 /* Tensors have PyTorch's shapes and are named down0.conv1.weight, down0.conv1.bias, down0.conv2.weight, ...,
@@ -380,14 +385,17 @@ GNN_API void gnn_unet_tensor_export(const gnn_unet *net, const float *floats, ui
 GNN_API void gnn_unet_tensor_import(gnn_unet *net, uint32_t index, const float *values);
 
 /* [exclusive] Weights out of a safetensors file in memory, by name; other tensors of the file do not matter. If the
-   file has what gnn_unet_save kept for training and desc.training is set, training goes on where it was. On failure
-   the network is as it was, and message (may be NULL) names the tensor. Safe for untrusted input. Allocates a table of
-   the file's tensors for the time of the call. */
+   file has what gnn_unet_save kept for training and desc.training is set, training goes on where it was. If its
+   metadata have the key gnn_unet, that must be of such a network, else GNN_WRONG_TENSOR. On failure the network is as
+   it was, and message (may be NULL) names the tensor. Safe for untrusted input. Allocates a table of the file's tensors
+   for the time of the call. */
 GNN_API gnn_result gnn_unet_load(gnn_unet *net, const void *file, size_t size, gnn_message *message);
-/* [any thread] Bytes that gnn_unet_save writes; 0 = out of memory. type F16 or F32; F32 of a network for training keeps
-   all that training needs to go on. metadata: see gnn_tensors_bound; may be NULL. */
+/* [any thread] Bytes that gnn_unet_save writes; 0 = out of memory, a bad type or metadata. A save's metadata have a key
+   of their own, "gnn_unet", that says what shapes do not: whether inputs are masked. type F16 or F32; F32 of a network
+   for training keeps all that training needs to go on. metadata: see gnn_tensors_bound; may be NULL. */
 GNN_API size_t gnn_unet_bound(const gnn_unet *net, gnn_type type, const char *const *metadata);
-/* [any thread] Allocates a copy of the weights for the time of the call. */
+/* [any thread] Allocates a copy of the weights for the time of the call. GNN_WRONG_TENSOR where a value is not finite,
+   or is 65520 or more and would be infinite as F16. */
 GNN_API gnn_result gnn_unet_save(const gnn_unet *net, gnn_type type, const char *const *metadata, void *buffer,
                                  size_t size, size_t *written);
 
@@ -433,6 +441,14 @@ GNN_API gnn_result gnn_unet_save(const gnn_unet *net, gnn_type type, const char 
 #define GNNI_UNROLL _Pragma("GCC unroll 16")
 #else
 #define GNNI_UNROLL
+#endif
+
+/* Contraction into fused multiply-adds off: results depend on the level of SIMD, not on the compiler's choices. */
+#if defined(__clang__)
+#pragma STDC FP_CONTRACT OFF
+#elif defined(__GNUC__)
+#pragma GCC push_options
+#pragma GCC optimize("fp-contract=off")
 #endif
 
 /* ---- >>levels ----------------------------------------------------------------------------------------------- */
@@ -765,9 +781,10 @@ GNN_API gnn_result gnn_conv_check(const gnn_conv *c)
     if (c->up && (c->width % 4 || c->height % 2))
         return GNN_BAD_SHAPE;
     if (c->up + c->in == 0 || c->up > 4096 || c->in > 4096 || c->out < 1 || c->out > 4096 || c->in_stride > 8192 ||
-        c->in_stride < c->in || (c->up && c->up_stride != gnn_stride(c->up)) || c->out_stride != gnn_stride(c->out))
+        c->in_stride < c->in || c->in_stride % 8 || (c->up && c->up_stride != gnn_stride(c->up)) ||
+        c->out_stride != gnn_stride(c->out))
         return GNN_BAD_RANGE;
-    return GNN_OK;
+    return gnn_resolve_simd(c->simd) == c->simd ? GNN_OK : GNN_BAD_OPTION; /* AUTO never resolves to itself */
 }
 
 static size_t gnni_in_weights(const gnn_conv *c) { return c->in ? (size_t)9 * c->in_stride * c->out_stride : 0; }
@@ -823,7 +840,7 @@ static void gnni_term_add(gnni_product *p, const float *a, size_t row_step, cons
 
 /* F(4x4, 3x3) of Lavin and Gray 2016: a tile of 4x4 outputs needs 36 products for 144. Tiles of 6x6 inputs are
    transformed, B^T d B; for each of the 36 places a matrix product over channels adds up; A^T m A gives the outputs.
-   Vectors run along channels. Rounding: about 1e-6 of the outputs' rms, up to 1e-5. */
+   Vectors run along channels. Rounding: about 1e-6 of the outputs' rms, up to 5e-5. */
 #define GNNI_TILES 32u /* worked on at once: 36 * 32 * (channels in and out) floats stay in the second-level cache */
 
 /* Fewer tiles than this do not share the transformed weights, four times as many bytes as the weights. Measured: at 8
@@ -833,7 +850,7 @@ static void gnni_term_add(gnni_product *p, const float *a, size_t row_step, cons
 static bool gnni_winograd(const gnn_conv *c)
 {
     return !c->no_winograd && c->width % 4 == 0 && c->height % 4 == 0 &&
-           (c->width / 4) * (c->height / 4) >= GNNI_MIN_TILES && (!c->in || c->in_stride % 8 == 0);
+           (c->width / 4) * (c->height / 4) >= GNNI_MIN_TILES;
 }
 
 static uint32_t gnni_channels(const gnn_conv *c) { return (c->up ? c->up_stride : 0) + (c->in ? c->in_stride : 0); }
@@ -998,7 +1015,7 @@ static void gnni_winograd_in(gnn_simd simd, const float *const *rows, const size
         if (simd == GNN_SIMD_AVX512 && c + 16 <= channels) {
             gnni_winograd_in_AVX512(r, columns, v + c, plane);
             step = 16;
-        } else if (simd != GNN_SIMD_SCALAR) {
+        } else if (simd == GNN_SIMD_AVX2 || simd == GNN_SIMD_AVX512) {
             gnni_winograd_in_AVX2(r, columns, v + c, plane);
         } else
 #elif GNNI_NEON
@@ -1021,7 +1038,7 @@ static void gnni_winograd_out(gnn_simd simd, const gnni_finish *f, uint32_t colu
         if (simd == GNN_SIMD_AVX512 && c + 16 <= columns) {
             gnni_winograd_out_AVX512(f, c);
             step = 16;
-        } else if (simd != GNN_SIMD_SCALAR) {
+        } else if (simd == GNN_SIMD_AVX2 || simd == GNN_SIMD_AVX512) {
             gnni_winograd_out_AVX2(f, c);
         } else
 #elif GNNI_NEON
@@ -1112,24 +1129,23 @@ static void gnni_winograd_forward(const gnn_conv *c, const float *bias, const fl
 /* What prepare derives, in this order. Upsampling: pixels of the output of equal parity (y & 1, x & 1) see the small
    map through a 2x2 kernel whose weights are sums of those of the 3x3 kernel: 4 multiplications for 9. */
 typedef struct gnni_prepared {
-    size_t up;       /* [4 parities][2x2][up_stride][out_stride] */
+    size_t up;       /* [4 parities][2x2][up_stride][out_stride]; up and in: only where Winograd's method is not used */
     size_t in;       /* [9][in_stride][out_stride] in pieces */
     size_t back_up;  /* [9 taps][out_stride][up_stride] in pieces of each tap, taps as in the forward pass */
-    size_t back_in;  /* the same with in_stride; only where that is a multiple of 8 */
+    size_t back_in;  /* the same with in_stride */
     size_t winograd; /* [36][channels][out_stride] in pieces; only where it is used */
     size_t total;
 } gnni_prepared;
 
-static bool gnni_has_back(const gnn_conv *c) { return c->in && c->in_stride % 8 == 0; }
-
 static gnni_prepared gnni_layout(const gnn_conv *c)
 {
     gnni_prepared p;
+    bool direct = !gnni_winograd(c);
     p.up = 0;
-    p.in = p.up + (c->up ? (size_t)16 * c->up_stride * c->out_stride : 0);
-    p.back_up = p.in + gnni_in_weights(c);
+    p.in = p.up + (direct && c->up ? (size_t)16 * c->up_stride * c->out_stride : 0);
+    p.back_up = p.in + (direct ? gnni_in_weights(c) : 0);
     p.back_in = p.back_up + gnni_up_weights(c);
-    p.winograd = p.back_in + (gnni_has_back(c) ? gnni_in_weights(c) : 0);
+    p.winograd = p.back_in + gnni_in_weights(c);
     p.total = p.winograd + gnni_winograd_prepared(c);
     return p;
 }
@@ -1185,17 +1201,18 @@ GNN_API void gnn_conv_prepare(const gnn_conv *c, const float *weights, float *pr
     const float *in = weights + gnni_up_weights(c);
     size_t up_tap = (size_t)c->up_stride * c->out_stride, in_tap = (size_t)c->in_stride * c->out_stride;
     uint32_t tap;
-    if (gnni_winograd(c))
+    bool direct = !gnni_winograd(c);
+    if (!direct)
         gnni_winograd_prepare(c, weights, prepared + at.winograd);
-    if (c->up) /* back_up is large enough to hold the sums on the way */
+    if (direct && c->up) /* back_up is large enough to hold the sums on the way */
         gnni_prepare_up(c, weights, prepared + at.up, prepared + at.back_up);
-    if (c->in)
+    if (direct && c->in)
         gnni_pack(in, (size_t)9 * c->in_stride, c->out_stride, prepared + at.in);
     for (tap = 0; tap < 9; ++tap) {
         if (c->up)
             gnni_pack_transposed(weights + tap * up_tap, c->up_stride, c->out_stride,
                                  prepared + at.back_up + tap * up_tap);
-        if (gnni_has_back(c))
+        if (c->in)
             gnni_pack_transposed(in + tap * in_tap, c->in_stride, c->out_stride, prepared + at.back_in + tap * in_tap);
     }
 }
@@ -1379,14 +1396,13 @@ static void gnni_backward_up(const gnn_conv *c, const float *back, const float *
         }
 }
 
-GNN_API void gnn_conv_backward(const gnn_conv *c, const float *weights, const float *prepared, const gnn_conv_maps *m,
-                               float *dout, float *dup, float *din, float *dadd, float *dweights, float *scratch)
+GNN_API void gnn_conv_backward(const gnn_conv *c, const float *prepared, const gnn_conv_maps *m, float *dout,
+                               float *dup, float *din, float *dadd, float *dweights, float *scratch)
 {
     gnni_prepared at = gnni_layout(c);
     size_t up = gnni_up_weights(c), in = gnni_in_weights(c), in_tap = (size_t)c->in_stride * c->out_stride;
     uint32_t y, tap;
-    (void)weights;
-    GNN_ASSERT(gnn_conv_check(c) == GNN_OK && (!din || gnni_has_back(c)));
+    GNN_ASSERT(gnn_conv_check(c) == GNN_OK && (!din || c->in) && (!dup || c->up));
     gnni_backward_tail(c, m, dout, dadd, dweights + up + in);
     for (tap = 0; c->in && tap < 9; ++tap)
         for (y = 0; y < c->height; ++y)
@@ -1462,6 +1478,22 @@ static bool gnni_json_need(gnni_json *j, char c)
     return gnni_json_take(j, c) || gnni_json_error(j, "the header is not the JSON that it should be");
 }
 
+static bool gnni_is_hex(char c) { return (c >= '0' && c <= '9') || (c >= 'a' && c <= 'f') || (c >= 'A' && c <= 'F'); }
+
+/* From a \ to the last character of the escape, or to the end; false where JSON has no such escape. */
+static bool gnni_json_escape(gnni_json *j)
+{
+    int k;
+    if (++j->at == j->end)
+        return true;
+    if (!*j->at || !strchr("\"\\/bfnrtu", *j->at))
+        return false;
+    for (k = *j->at == 'u' ? 4 : 0; k > 0; --k)
+        if (++j->at == j->end || !gnni_is_hex(*j->at))
+            return j->at == j->end;
+    return true;
+}
+
 /* A string, escapes left as they stand. */
 static bool gnni_json_string(gnni_json *j, const char **text, size_t *length, bool *escapes)
 {
@@ -1474,7 +1506,9 @@ static bool gnni_json_string(gnni_json *j, const char **text, size_t *length, bo
             return gnni_json_error(j, "a control character in a string of the header");
         if (*j->at == '\\') {
             *escapes = true;
-            if (++j->at == j->end)
+            if (!gnni_json_escape(j))
+                return gnni_json_error(j, "a bad escape in a string of the header");
+            if (j->at == j->end)
                 break;
         }
     }
@@ -1529,9 +1563,9 @@ static bool gnni_is(const char *text, size_t length, const char *word)
 /* Bits of an element; 0 = no such type. */
 static uint32_t gnni_type_bits(const char *text, size_t length)
 {
-    static const char *const names[] = {"BOOL", "U8",  "I8",  "F8_E5M2", "F8_E4M3", "I16", "U16", "F16",
-                                        "BF16", "I32", "U32", "F32",     "F64",     "I64", "U64"};
-    static const unsigned char bits[] = {8, 8, 8, 8, 8, 16, 16, 16, 16, 32, 32, 32, 64, 64, 64};
+    static const char *const names[] = {"BOOL", "U8",  "I8",  "F8_E5M2", "F8_E4M3", "F8_E8M0", "I16", "U16", "F16",
+                                        "BF16", "I32", "U32", "F32",     "F64",     "I64",     "U64", "C64"};
+    static const unsigned char bits[] = {8, 8, 8, 8, 8, 8, 16, 16, 16, 16, 32, 32, 32, 64, 64, 64, 64};
     uint32_t i;
     for (i = 0; i < sizeof bits; ++i)
         if (gnni_is(text, length, names[i]))
@@ -2026,16 +2060,22 @@ GNN_API size_t gnn_tensors_bound(const gnn_weight *weights, uint32_t count, cons
 {
     gnni_writer w;
     uint64_t size = 0;
-    uint32_t i;
+    uint32_t i, k;
     w.bytes = NULL;
     w.at = 8;
-    for (i = 0; metadata && metadata[i]; ++i)
-        if (!gnni_printable(metadata[i], false) ||
-            (i % 2 == 0 && (!metadata[i + 1] || !gnni_printable(metadata[i], true))))
+    for (i = 0; metadata && metadata[i]; i += 2) {
+        if (!gnni_printable(metadata[i], true) || !gnni_printable(metadata[i + 1], false))
             return 0;
+        for (k = 0; k < i; k += 2)
+            if (strcmp(metadata[k], metadata[i]) == 0)
+                return 0;
+    }
     for (i = 0; i < count; ++i) {
         if (!gnni_weight_ok(&weights[i]))
             return 0;
+        for (k = 0; k < i; ++k)
+            if (strcmp(weights[k].name, weights[i].name) == 0)
+                return 0;
         size += gnni_weight_count(&weights[i]) * (weights[i].type == GNN_TYPE_F32 ? 4 : 2);
     }
     gnni_write_header(&w, weights, count, metadata);
@@ -2164,6 +2204,7 @@ GNN_API double gnn_loss(const float *out, const float *input, const float *truth
 #define GNNI_ALIGN(n) (((n) + 15) & ~(size_t)15) /* floats of a cache line */
 #define GNNI_HEAD 8                              /* columns that a head's one output is computed in */
 #define GNNI_MAX_LOSS 1e6                        /* of a map; beyond, a photon of 1e30 W or the like is in it */
+#define GNNI_MAX_GRADIENT 1e15f                  /* its square is far from overflow */
 
 static void *gnni_default_allocate(void *user, size_t size)
 {
@@ -2200,7 +2241,7 @@ struct gnn_unet {
     size_t floats, prepared_floats, scratch;
     gnni_places run, train;
     uint64_t step;
-    float *weights, *prepared, *first, *second, *gradients;
+    float *weights, *prepared, *first, *second, *gradients; /* the last three: NULL but for training */
 };
 
 static uint32_t gnni_ups(const gnn_unet *n) { return n->desc.levels - 1; }
@@ -2211,6 +2252,23 @@ static uint32_t gnni_heads(const gnn_unet *n) { return n->desc.levels > 1 ? n->d
 static bool gnni_within(double x, double low, double high) { return x >= low && x <= high; }
 
 static void gnni_default(float *x, float value) { *x = *x != 0 ? *x : value; }
+
+/* No allocation or part of a workspace has more floats than this. It need not be close: it is there to refuse what a
+   size_t of 32 bits cannot count. */
+static uint64_t gnni_most_floats(const gnn_unet_desc *d)
+{
+    uint64_t sum = 1 << 20; /* names, tables, alignment */
+    uint32_t l;
+    for (l = 0; l < d->levels; ++l) {
+        uint64_t s = gnn_stride(d->channels[l]), in = gnn_stride(l ? d->channels[l - 1] : d->inputs);
+        uint64_t up = l + 1 < d->levels ? gnn_stride(d->channels[l + 1]) : 0, all = in + 4 * s + up;
+        uint64_t pixels = (uint64_t)((d->width >> l) + 2) * ((d->height >> l) + 2);
+        sum += pixels * (2 * all + 32);        /* maps, their gradients, planes, scratch */
+        sum += 36 * 2 * (uint64_t)32 * all;    /* scratch of Winograd's method */
+        sum += 16 * up * s + 10 * 9 * s * all; /* weights, what is prepared, moments, gradients */
+    }
+    return sum;
+}
 
 GNN_API gnn_result gnn_unet_resolve(gnn_unet_desc *d)
 {
@@ -2234,7 +2292,9 @@ GNN_API gnn_result gnn_unet_resolve(gnn_unet_desc *d)
     gnni_default(&d->beta1, 0.9f);
     gnni_default(&d->beta2, 0.999f);
     if (!gnni_within(d->lambda, 1, 100) || !(d->deep == -1 || gnni_within(d->deep, 0, 100)) ||
-        !gnni_within(d->rate, 1e-8, 1) || !gnni_within(d->beta1, 0, 0.99999) || !gnni_within(d->beta2, 0, 0.99999))
+        !gnni_within(d->rate, 1e-8f, 1) || !gnni_within(d->beta1, 0, 0.99999) || !gnni_within(d->beta2, 0, 0.99999))
+        return GNN_BAD_RANGE;
+    if (gnni_most_floats(d) > SIZE_MAX / sizeof(float))
         return GNN_BAD_RANGE;
     d->simd = gnn_resolve_simd(d->simd);
     if (d->simd == GNN_SIMD_AUTO)
@@ -2369,9 +2429,11 @@ GNN_API gnn_result gnn_unet_create(const gnn_unet_desc *desc, gnn_unet **out)
         return GNN_OUT_OF_MEMORY;
     }
     n->prepared = n->weights + n->floats;
-    n->first = n->prepared + n->prepared_floats;
-    n->second = n->first + n->floats;
-    n->gradients = n->second + n->floats;
+    if (d.training) {
+        n->first = n->prepared + n->prepared_floats;
+        n->second = n->first + n->floats;
+        n->gradients = n->second + n->floats;
+    }
     memset(n->weights, 0, floats * sizeof(float));
     gnn_unet_seed(n, 1);
     *out = n;
@@ -2390,7 +2452,12 @@ GNN_API void gnn_unet_destroy(gnn_unet *n)
 
 GNN_API gnn_unet_desc gnn_unet_get_desc(const gnn_unet *n) { return n->desc; }
 GNN_API size_t gnn_unet_floats(const gnn_unet *n) { return n->floats; }
-GNN_API void gnn_unet_set_rate(gnn_unet *n, float rate) { n->desc.rate = rate; }
+
+GNN_API void gnn_unet_set_rate(gnn_unet *n, float rate)
+{
+    GNN_ASSERT(gnni_within(rate, 1e-8f, 1));
+    n->desc.rate = rate;
+}
 
 /* ---- >>named ------------------------------------------------------------------------------------------------ */
 
@@ -2689,7 +2756,8 @@ typedef struct gnni_job {
 GNN_API size_t gnn_unet_workspace(const gnn_unet *n, uint32_t maps, bool train)
 {
     size_t part = (train ? n->train.total : n->run.total) * sizeof(float);
-    return part * (maps ? maps : 1) + 64;
+    maps = maps ? maps : 1;
+    return maps > (SIZE_MAX - 64) / part ? SIZE_MAX : part * maps + 64;
 }
 
 /* The parts of a workspace: their number, 0 = none fits. */
@@ -2804,15 +2872,14 @@ static double gnni_losses(const gnni_map *m, const float *input, const float *tr
     return sum;
 }
 
-/* Gradient maps lie where the maps do; g is where those begin. dup, din: places of them, dadd too; none = 0. */
+/* Gradient maps lie where the maps do; g is where those begin. dup, din, dadd: NULL = not wanted. */
 static void gnni_layer_backward(const gnni_map *m, const gnni_layer *l, const gnn_conv_maps *maps, size_t out,
                                 float *dup, float *din, float *dadd)
 {
     gnn_conv_maps all = *maps;
     all.out = m->w + out;
-    gnn_conv_backward(&l->conv, m->net->weights + l->weights, m->net->prepared + l->prepared, &all,
-                      m->w + m->at->gradients + out, dup, din, dadd, m->w + m->at->weights + l->weights,
-                      m->w + m->at->scratch);
+    gnn_conv_backward(&l->conv, m->net->prepared + l->prepared, &all, m->w + m->at->gradients + out, dup, din, dadd,
+                      m->w + m->at->weights + l->weights, m->w + m->at->scratch);
 }
 
 static void gnni_up_backward(const gnni_map *m)
@@ -2855,13 +2922,13 @@ static void gnni_down_backward(const gnni_map *m)
     }
 }
 
-static bool gnni_all_finite(const float *x, size_t count)
+/* |x| < limit for all; false for NaN. */
+static bool gnni_all_below(const float *x, size_t count, float limit)
 {
-    float sum = 0; /* x - x is 0, or NaN for what is not finite */
-    size_t i;
+    size_t i, good = 0;
     for (i = 0; i < count; ++i)
-        sum += x[i] - x[i];
-    return sum == 0;
+        good += fabsf(x[i]) < limit;
+    return good == count;
 }
 
 static void gnni_train_range(void *context, uint32_t begin, uint32_t end)
@@ -2883,7 +2950,7 @@ static void gnni_train_range(void *context, uint32_t begin, uint32_t end)
         loss = gnni_losses(&m, input, j->truths + (j->first + begin) * area);
         gnni_up_backward(&m);
         gnni_down_backward(&m);
-        if (!(loss < GNNI_MAX_LOSS) || !gnni_all_finite(m.w + j->at->weights, j->net->floats))
+        if (!(loss < GNNI_MAX_LOSS) || !gnni_all_below(m.w + j->at->weights, j->net->floats, GNNI_MAX_GRADIENT))
             loss = -1;                                 /* refused */
         memcpy(m.w + j->at->head, &loss, sizeof loss); /* for whoever adds up */
     }
@@ -2944,7 +3011,10 @@ GNN_API gnn_result gnn_unet_train(gnn_unet *n, const float *inputs, const float 
                                   void *workspace, size_t size, gnn_parallel_fn parallel, void *parallel_user)
 {
     gnn_result result;
-    GNN_ASSERT(n->desc.training);
+    if (!n->desc.training) {
+        memset(step, 0, sizeof *step);
+        return GNN_BAD_OPTION;
+    }
     result = gnn_unet_gradients(n, inputs, truths, count, n->gradients, step, workspace, size, parallel, parallel_user);
     if (result || !step->maps)
         return result;
@@ -2981,7 +3051,7 @@ static gnn_result gnni_load_tensor(const gnn_unet *n, float *floats, uint32_t in
         return gnni_fail(message, GNN_WRONG_TENSOR, "its shape does not fit the network", t);
     if (!gnn_tensor_floats(t, 0, wanted, values))
         return gnni_fail(message, GNN_WRONG_TENSOR, "its dtype is neither F32 nor F16", t);
-    if (!gnni_all_finite(values, (size_t)wanted))
+    if (!gnni_all_below(values, (size_t)wanted, INFINITY))
         return gnni_fail(message, GNN_WRONG_TENSOR, "it has values that are not finite", t);
     gnni_import(n, floats, index, values);
     return GNN_OK;
@@ -3008,10 +3078,34 @@ static gnn_result gnni_load_all(const gnn_unet *n, const gnn_tensor *tensors, ui
         !(halves[1] >= 0 && halves[1] < 16777216.0f))
         return gnni_fail(message, GNN_WRONG_TENSOR, "it must be two counts", t);
     *step = (uint64_t)halves[0] + ((uint64_t)halves[1] << 24);
+    if (!gnni_all_below(fresh + n->floats, n->floats, 2 * GNNI_MAX_GRADIENT))
+        return gnni_fail(message, GNN_WRONG_TENSOR, "a tensor adam1. has values that are too large", NULL);
     for (i = 0; i < n->floats; ++i)
-        if (fresh[2 * n->floats + i] < 0)
-            return gnni_fail(message, GNN_WRONG_TENSOR, "a tensor adam2. has negative values", NULL);
+        if (!(fresh[2 * n->floats + i] >= 0 && fresh[2 * n->floats + i] < 4 * GNNI_MAX_GRADIENT * GNNI_MAX_GRADIENT))
+            return gnni_fail(message, GNN_WRONG_TENSOR, "a tensor adam2. has values out of range", NULL);
     return GNN_OK;
+}
+
+/* Of what kind a network is, as metadata: "1 masked inputs=5 levels=3". 1: of the format. */
+static void gnni_kind(const gnn_unet *n, char text[40])
+{
+    gnni_writer w;
+    w.bytes = (unsigned char *)text;
+    w.at = 0;
+    gnni_put(&w, n->desc.no_mask ? "1 unmasked inputs=" : "1 masked inputs=");
+    gnni_put_number(&w, n->desc.inputs);
+    gnni_put(&w, " levels=");
+    gnni_put_number(&w, n->desc.levels);
+    text[w.at] = 0;
+}
+
+static gnn_result gnni_check_kind(const gnn_unet *n, const void *file, size_t size, gnn_message *message)
+{
+    char wanted[40], text[64]; /* what is cut differs too */
+    gnni_kind(n, wanted);
+    if (!gnn_tensors_metadata(file, size, "gnn_unet", text, sizeof text) || strcmp(text, wanted) == 0)
+        return GNN_OK;
+    return gnni_fail(message, GNN_WRONG_TENSOR, "its metadata say that the file is of another kind of network", NULL);
 }
 
 GNN_API gnn_result gnn_unet_load(gnn_unet *n, const void *file, size_t size, gnn_message *message)
@@ -3032,6 +3126,8 @@ GNN_API gnn_result gnn_unet_load(gnn_unet *n, const void *file, size_t size, gnn
         memset(fresh, 0, 3 * n->floats * sizeof *fresh);
         result = gnn_tensors_read(file, size, tensors, count, &count, message);
         if (!result)
+            result = gnni_check_kind(n, file, size, message);
+        if (!result)
             result = gnni_load_all(n, tensors, count, fresh, fresh + 3 * n->floats, &step, message);
         if (!result) {
             memcpy(n->weights, fresh, n->floats * sizeof(float));
@@ -3047,32 +3143,49 @@ GNN_API gnn_result gnn_unet_load(gnn_unet *n, const void *file, size_t size, gnn
     return result;
 }
 
-/* The list of what is saved, and values for it in `values`; names point into it too. */
+/* The list of what is saved; values, names and pointers to metadata lie behind it in memory. */
 typedef struct gnni_save {
     gnn_weight *weights;
     uint32_t count;
-    float *values;
-    char (*names)[64];
+    const char **metadata;
+    char kind[40];
     void *memory;
 } gnni_save;
 
-static bool gnni_save_plan(const gnn_unet *n, gnn_type type, gnni_save *s)
+/* "gnn_unet" and its text, then the caller's pairs, NULL. */
+static void gnni_save_metadata(const gnn_unet *n, const char *const *metadata, size_t pointers, gnni_save *s)
+{
+    gnni_kind(n, s->kind);
+    memset(s->metadata, 0, (pointers + 3) * sizeof *s->metadata);
+    s->metadata[0] = "gnn_unet";
+    s->metadata[1] = s->kind;
+    if (pointers)
+        memcpy(s->metadata + 2, metadata, pointers * sizeof *metadata);
+}
+
+static bool gnni_save_plan(const gnn_unet *n, gnn_type type, const char *const *metadata, gnni_save *s)
 {
     uint32_t kinds = n->desc.training && type == GNN_TYPE_F32 ? 3 : 1, count = gnn_unet_tensors(n), kind, i;
-    size_t list = (kinds * count + 1) * sizeof(gnn_weight), names = kinds * count * sizeof *s->names;
+    size_t list = (kinds * count + 1) * sizeof(gnn_weight), names = (size_t)kinds * count * 64, pointers = 0;
+    size_t keys;
+    char *name;
     float *values;
-    s->memory = n->desc.allocate(n->desc.user, list + names + (kinds * n->floats + 2) * sizeof(float));
+    while (metadata && metadata[pointers])
+        ++pointers;
+    keys = (pointers + 3) * sizeof *s->metadata;
+    s->memory = n->desc.allocate(n->desc.user, list + keys + names + (kinds * n->floats + 2) * sizeof(float));
     if (!s->memory)
         return false;
     s->weights = (gnn_weight *)s->memory;
-    s->names = (char(*)[64])(void *)((char *)s->memory + list);
-    s->values = values = (float *)(void *)((char *)s->memory + list + names);
+    s->metadata = (const char **)(void *)((char *)s->memory + list);
+    name = (char *)s->memory + list + keys;
+    values = (float *)(void *)(name + names);
     s->count = 0;
     memset(s->weights, 0, list);
+    gnni_save_metadata(n, metadata, pointers, s);
     for (kind = 0; kind < kinds; ++kind)
-        for (i = 0; i < count; ++i, ++s->count) {
+        for (i = 0; i < count; ++i, ++s->count, name += 64) {
             gnn_weight *w = &s->weights[s->count];
-            char *name = s->names[s->count];
             const float *from = kind == 0 ? n->weights : kind == 1 ? n->first : n->second;
             memcpy(name, gnni_kinds[kind], strlen(gnni_kinds[kind]));
             w->name = name;
@@ -3098,9 +3211,9 @@ GNN_API size_t gnn_unet_bound(const gnn_unet *n, gnn_type type, const char *cons
 {
     gnni_save s;
     size_t bound;
-    if (!gnni_save_plan(n, type, &s))
+    if (!gnni_save_plan(n, type, metadata, &s))
         return 0;
-    bound = gnn_tensors_bound(s.weights, s.count, metadata);
+    bound = gnn_tensors_bound(s.weights, s.count, s.metadata);
     n->desc.release(n->desc.user, s.memory);
     return bound;
 }
@@ -3109,14 +3222,24 @@ GNN_API gnn_result gnn_unet_save(const gnn_unet *n, gnn_type type, const char *c
                                  size_t size, size_t *written)
 {
     gnni_save s;
-    gnn_result result;
+    gnn_result result = GNN_OK;
+    uint32_t i;
     *written = 0;
-    if (!gnni_save_plan(n, type, &s))
+    if (!gnni_save_plan(n, type, metadata, &s))
         return GNN_OUT_OF_MEMORY;
-    result = gnn_tensors_write(s.weights, s.count, metadata, buffer, size, written);
+    for (i = 0; i < s.count; ++i) /* 65520 is the first to round to infinity */
+        if (!gnni_all_below(s.weights[i].values, (size_t)gnni_weight_count(&s.weights[i]),
+                            type == GNN_TYPE_F16 ? 65520.0f : INFINITY))
+            result = GNN_WRONG_TENSOR;
+    if (!result)
+        result = gnn_tensors_write(s.weights, s.count, s.metadata, buffer, size, written);
     n->desc.release(n->desc.user, s.memory);
     return result;
 }
+
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC pop_options
+#endif
 
 #endif /* GNN_IMPLEMENTATION */
 

@@ -340,7 +340,7 @@ static void bad_values_stay_in_their_map(void **state)
             GNN_OK);
         assert_int_equal(step.refused, 1);
         assert_int_equal(step.maps, 2);
-        assert_true(gnni_all_finite(gradients, gnn_unet_floats(net)));
+        assert_true(gnni_all_below(gradients, gnn_unet_floats(net), INFINITY));
         inputs[map + 7] = saved[0], inputs[map + area + 9] = saved[1];
     }
     /* the gradient of the two that count is what these two alone give */
@@ -360,6 +360,41 @@ static void bad_values_stay_in_their_map(void **state)
     free(inputs), free(truths), free(good), free(outputs), free(want), free(gradients);
 }
 
+/* Finite, and the loss is small: but a square of such a derivative would stay in Adam's moments. */
+static void huge_derivatives_are_left_out_of_training(void **state)
+{
+    gnn_unet_desc d = small_desc(2, false);
+    gnn_unet *net = make_net(&d);
+    size_t area = (size_t)d.width * d.height, floats = gnn_unet_floats(net);
+    float *inputs = new_floats(d.inputs * area), *truths = new_floats(area), *before = new_floats(3 * floats),
+          zeros[16];
+    gnn_step step;
+    workspace space = make_workspace(net, 1, true);
+    (void)state;
+    seed(9);
+    draw_maps(&d, 1, inputs, truths);
+    memset(zeros, 0, sizeof zeros);
+    for (uint32_t i = 12; i < gnn_unet_tensors(net); ++i) /* the head: the output is input 0 then */
+        gnn_unet_tensor_import(net, i, zeros);
+    for (int k = 0; k < 2; ++k) {
+        float value = k ? 1e19f : 1e12f;
+        for (size_t i = 0; i < area; ++i)
+            inputs[area + i] = inputs[2 * area + i] > 0 ? value : 0;
+        memcpy(before, net->weights, floats * sizeof(float));
+        memcpy(before + floats, net->first, 2 * floats * sizeof(float));
+        assert_int_equal(gnn_unet_train(net, inputs, truths, 1, &step, start(&space), space.size, NULL, NULL), GNN_OK);
+        assert_int_equal(step.refused, k);
+        assert_true(k || step.loss < 10);
+        assert_int_equal(memcmp(before, net->weights, floats * sizeof(float)) == 0, k);
+        assert_int_equal(memcmp(before + floats, net->first, 2 * floats * sizeof(float)) == 0, k);
+        for (uint32_t i = 12; i < gnn_unet_tensors(net); ++i)
+            gnn_unet_tensor_import(net, i, zeros);
+    }
+    free(space.memory);
+    gnn_unet_destroy(net);
+    free(inputs), free(truths), free(before);
+}
+
 static void empty_full_and_one_bin_maps_give_finite_output(void **state)
 {
     gnn_unet_desc d;
@@ -376,7 +411,7 @@ static void empty_full_and_one_bin_maps_give_finite_output(void **state)
             inputs[(2 * d.inputs + c) * area + i] = 1;
     }
     assert_int_equal(gnn_unet_forward(net, inputs, 3, outputs, start(&space), space.size, NULL, NULL), GNN_OK);
-    assert_true(gnni_all_finite(outputs, 3 * area));
+    assert_true(gnni_all_below(outputs, 3 * area, INFINITY));
     for (size_t i = 1; i < area; ++i) { /* a map that is even stays so: the wrapped borders are no borders */
         BELOW(fabs((double)(outputs[i] - outputs[0])), 1e-6);
         BELOW(fabs((double)(outputs[2 * area + i] - outputs[2 * area])), 1e-6);
@@ -423,6 +458,51 @@ static void small_workspaces_and_bad_descriptors_are_refused(void **state)
     gnn_unet_destroy(net);
     gnn_unet_destroy(NULL);
     free(inputs), free(outputs), free(gradients);
+}
+
+static void training_needs_a_network_for_it(void **state)
+{
+    gnn_unet_desc d = small_desc(2, false);
+    d.training = false;
+    gnn_unet *net = make_net(&d);
+    float *inputs = new_floats(3 * 128), *truths = new_floats(128), *before = new_floats(gnn_unet_floats(net));
+    gnn_step step = {1, 1, 1};
+    workspace space = make_workspace(net, 1, true);
+    (void)state;
+    memcpy(before, net->weights, gnn_unet_floats(net) * sizeof(float));
+    assert_true(!net->first && !net->second && !net->gradients);
+    assert_int_equal(gnn_unet_train(net, inputs, truths, 1, &step, start(&space), space.size, NULL, NULL),
+                     GNN_BAD_OPTION);
+    assert_true(step.loss == 0 && step.maps == 0 && step.refused == 0);
+    assert_memory_equal(before, net->weights, gnn_unet_floats(net) * sizeof(float));
+    free(inputs), free(truths), free(before), free(space.memory);
+    gnn_unet_destroy(net);
+}
+
+static void sizes_stay_below_the_bound_and_do_not_wrap(void **state)
+{
+    static const uint32_t shapes[][4] = {{64, 32, 5, 3}, {1024, 1024, 16, 1}, {64, 32, 1, 6}, {2, 1, 1, 1}};
+    static const uint32_t channels[] = {1, 8, 33};
+    (void)state;
+    for (int k = 0; k < 12; ++k) {
+        gnn_unet_desc d;
+        memset(&d, 0, sizeof d);
+        d.width = shapes[k / 3][0], d.height = shapes[k / 3][1], d.inputs = shapes[k / 3][2],
+        d.levels = shapes[k / 3][3];
+        for (uint32_t l = 0; l < d.levels; ++l)
+            d.channels[l] = channels[k % 3];
+        d.training = true;
+        gnn_unet *net = make_net(&d);
+        uint64_t most = gnni_most_floats(&net->desc), place = net->train.total;
+        assert_true(place <= most && net->run.total <= most && 4 * net->floats + net->prepared_floats <= most);
+        assert_true(gnn_unet_workspace(net, 0, true) == place * sizeof(float) + 64);
+        assert_true(gnn_unet_workspace(net, 7, true) == 7 * place * sizeof(float) + 64);
+        net->train.total = SIZE_MAX / 16;
+        assert_true(gnn_unet_workspace(net, 3, true) == SIZE_MAX / 16 * 4 * 3 + 64);
+        assert_true(gnn_unet_workspace(net, 4, true) == SIZE_MAX);
+        assert_true(gnn_unet_workspace(net, UINT32_MAX, true) == SIZE_MAX);
+        gnn_unet_destroy(net);
+    }
 }
 
 static void failed_allocations_are_told_and_nothing_leaks(void **state)
@@ -558,7 +638,75 @@ static void spoiled_weights_are_refused_name_the_tensor_and_change_nothing(void 
             free(file);
         }
     assert_int_equal(gnn_unet_load(net, "nothing", 7, &message), GNN_BAD_FILE);
+    size_t size; /* what says nothing of its kind, and is not spoiled */
+    char *file = spoiled_file(net, 0, -1, &size);
+    assert_int_equal(gnn_unet_load(net, file, size, &message), GNN_OK);
+    free(file);
     free(before);
+    gnn_unet_destroy(net);
+}
+
+static gnn_result saved_as(const gnn_unet *net, gnn_type type, const char *const *metadata, char **file, size_t *size)
+{
+    size_t bound = gnn_unet_bound(net, type, metadata);
+    *file = malloc(bound + 1);
+    return gnn_unet_save(net, type, metadata, *file, bound, size);
+}
+
+static void saves_say_of_which_kind_they_are(void **state)
+{
+    const char *mine[] = {"gnn_unet", "x", NULL}, *note[] = {"note", "y", NULL};
+    gnn_unet_desc d = small_desc(3, false), unmasked = small_desc(3, true);
+    gnn_unet *net = make_net(&d), *other = make_net(&unmasked);
+    gnn_message message;
+    char text[64], *file;
+    size_t size;
+    (void)state;
+    assert_int_equal(saved_as(net, GNN_TYPE_F16, note, &file, &size), GNN_OK);
+    assert_true(gnn_tensors_metadata(file, size, "gnn_unet", text, sizeof text));
+    assert_string_equal(text, "1 masked inputs=3 levels=3");
+    assert_true(gnn_tensors_metadata(file, size, "note", text, sizeof text));
+    assert_string_equal(text, "y");
+    assert_int_equal(gnn_unet_load(net, file, size, &message), GNN_OK);
+    assert_int_equal(gnn_unet_load(other, file, size, &message), GNN_WRONG_TENSOR);
+    assert_non_null(strstr(message.text, "kind"));
+    free(file);
+    assert_int_equal(gnn_unet_bound(net, GNN_TYPE_F16, mine), 0);
+    assert_int_equal(saved_as(net, GNN_TYPE_F16, mine, &file, &size), GNN_BAD_RANGE);
+    free(file);
+    gnn_unet_destroy(net);
+    gnn_unet_destroy(other);
+}
+
+static void values_that_would_not_load_are_not_saved(void **state)
+{
+    static const struct {
+        float value;
+        gnn_result half, full;
+    } all[] = {{65519.9f, GNN_OK, GNN_OK},
+               {65520.0f, GNN_WRONG_TENSOR, GNN_OK},
+               {-1e30f, GNN_WRONG_TENSOR, GNN_OK},
+               {INFINITY, GNN_WRONG_TENSOR, GNN_WRONG_TENSOR},
+               {NAN, GNN_WRONG_TENSOR, GNN_WRONG_TENSOR}};
+    gnn_unet_desc d = small_desc(2, false);
+    gnn_unet *net = make_net(&d);
+    char *file;
+    size_t size;
+    (void)state;
+    for (size_t i = 0; i < sizeof all / sizeof *all; ++i)
+        for (int half = 0; half < 2; ++half) {
+            gnn_unet_tensor_import(net, gnn_unet_tensors(net) - 1, &all[i].value);
+            gnn_result want = half ? all[i].half : all[i].full;
+            assert_int_equal(saved_as(net, half ? GNN_TYPE_F16 : GNN_TYPE_F32, NULL, &file, &size), want);
+            if (want == GNN_OK)
+                assert_int_equal(gnn_unet_load(net, file, size, NULL), GNN_OK);
+            free(file);
+        }
+    gnn_unet_seed(net, 1);
+    net->second[0] = 1e31f; /* finite, but no moment of training */
+    assert_int_equal(saved_as(net, GNN_TYPE_F32, NULL, &file, &size), GNN_OK);
+    assert_int_equal(gnn_unet_load(net, file, size, NULL), GNN_WRONG_TENSOR);
+    free(file);
     gnn_unet_destroy(net);
 }
 
@@ -678,11 +826,16 @@ int main(void)
         cmocka_unit_test(results_do_not_depend_on_threads_and_groups),
         cmocka_unit_test(levels_of_simd_agree),
         cmocka_unit_test(bad_values_stay_in_their_map),
+        cmocka_unit_test(huge_derivatives_are_left_out_of_training),
         cmocka_unit_test(empty_full_and_one_bin_maps_give_finite_output),
         cmocka_unit_test(small_workspaces_and_bad_descriptors_are_refused),
+        cmocka_unit_test(training_needs_a_network_for_it),
+        cmocka_unit_test(sizes_stay_below_the_bound_and_do_not_wrap),
         cmocka_unit_test(failed_allocations_are_told_and_nothing_leaks),
         cmocka_unit_test(saved_training_goes_on_as_if_it_had_not_stopped),
         cmocka_unit_test(spoiled_weights_are_refused_name_the_tensor_and_change_nothing),
+        cmocka_unit_test(saves_say_of_which_kind_they_are),
+        cmocka_unit_test(values_that_would_not_load_are_not_saved),
         cmocka_unit_test(training_repairs_histograms_it_has_not_seen),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

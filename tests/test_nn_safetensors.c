@@ -216,6 +216,11 @@ static void hostile_headers_are_refused_and_name_the_tensor(void **state)
         {"{\"w1\":{\"dtype\":\"F32\",\"shape\":[1],\"data_offsets\":[0,4]},}", 4, ""},
         {"{\"w1", 0, "no end"},
         {"{\"w1\\", 0, "no end"},
+        {"{\"__metadata__\":{\"a\":\"\\u12", 0, "no end"},
+        {"{\"__metadata__\":{\"a\":\"\\x\"}}", 0, "bad escape"},
+        {"{\"__metadata__\":{\"a\":\"\\u12g4\"}}", 0, "bad escape"},
+        {"{\"__metadata__\":{\"a\":\"\\u123\"}}", 0, "bad escape"},
+        {"{\"w1\\'\":{}}", 0, "bad escape"},
         {"{\"w\n1\":{}}", 0, "control"},
         {"{", 0, "header"},
         {"{}x", 0, "follows"},
@@ -233,6 +238,9 @@ static void hostile_headers_are_refused_and_name_the_tensor(void **state)
             fail_msg("%s: result %d, says: %s", all[i].header, (int)result, message.text);
         assert_int_equal(read_header(all[i].header, all[i].data, NULL), GNN_BAD_FILE);
     }
+    assert_int_equal(read_header("{\"__metadata__\":{\"a\":\"\\\"\\\\\\/\\b\\f\\n\\r\\t\\u09aF\"}}", 0, NULL), GNN_OK);
+    assert_int_equal(read_header("{" T("w1", "C64", "2", "0", "16") "}", 16, NULL), GNN_OK);
+    assert_int_equal(read_header("{" T("w1", "F8_E8M0", "3", "0", "3") "}", 3, NULL), GNN_OK);
     assert_int_equal(read_header("{}", 0, &message), GNN_OK);
     assert_string_equal(message.text, "");
 }
@@ -285,11 +293,24 @@ static void read_all(const file *f, const gnn_tensor *t, uint32_t count)
     gnn_tensors_metadata(f->bytes, f->size, "note", text, sizeof text);
 }
 
-static void flipped_bits_and_bytes_never_overrun(void **state)
+/* Up to three bits or pieces of text of the first `most` bytes changed. */
+static void mutate(unsigned char *bytes, size_t size, size_t most)
 {
     static const char *const pieces[] = {
         "\"",           "{",         "}",   "[", "]",     ",",           ":", "\\", "0", "9", "18446744073709551615",
         "\"net.bias\"", "\"dtype\"", "F16", " ", "\\u00", "__metadata__"};
+    for (uint64_t k = 1 + rng_next() % 3; k > 0; --k) {
+        size_t at = rng_next() % most;
+        const char *piece = pieces[rng_next() % (sizeof pieces / sizeof *pieces)];
+        if (rng_next() % 2)
+            bytes[at] ^= (unsigned char)(1 << rng_next() % 8);
+        else if (at + strlen(piece) <= size)
+            memcpy(bytes + at, piece, strlen(piece));
+    }
+}
+
+static void flipped_bits_and_bytes_never_overrun(void **state)
+{
     float values[24];
     gnn_tensor t[8];
     uint32_t count, accepted = 0, refused = 0;
@@ -300,14 +321,7 @@ static void flipped_bits_and_bytes_never_overrun(void **state)
     for (int round = 0; round < 60000; ++round) {
         file g = {copy, f.size};
         memcpy(copy, f.bytes, f.size);
-        for (uint64_t k = 1 + rng_next() % 3; k > 0; --k) {
-            size_t at = rng_next() % (f.size - 56);
-            const char *piece = pieces[rng_next() % (sizeof pieces / sizeof *pieces)];
-            if (rng_next() % 2)
-                copy[at] ^= (unsigned char)(1 << rng_next() % 8);
-            else if (at + strlen(piece) <= f.size)
-                memcpy(copy + at, piece, strlen(piece));
-        }
+        mutate(copy, f.size, f.size - 56);
         if (gnn_tensors_read(g.bytes, g.size, t, 8, &count, NULL) == GNN_OK) {
             read_all(&g, t, count);
             ++accepted;
@@ -320,6 +334,61 @@ static void flipped_bits_and_bytes_never_overrun(void **state)
     assert_true(accepted > 100 && refused > 10000); /* both ways were taken */
     free(copy);
     free(f.bytes);
+}
+
+static file training_save(const gnn_unet *net)
+{
+    size_t size = gnn_unet_bound(net, GNN_TYPE_F32, NULL), written;
+    file f = {malloc(size), size};
+    assert_non_null(f.bytes);
+    assert_int_equal(gnn_unet_save(net, GNN_TYPE_F32, NULL, f.bytes, size, &written), GNN_OK);
+    assert_int_equal(written, size);
+    return f;
+}
+
+/* A network takes a changed save, and is sound then, or refuses it and is as it was. */
+static void changed_saves_of_networks_load_whole_or_not_at_all(void **state)
+{
+    gnn_unet_desc d;
+    gnn_unet *net;
+    uint32_t accepted = 0, refused = 0;
+    (void)state;
+    memset(&d, 0, sizeof d);
+    d.width = 8, d.height = 4, d.inputs = 2, d.levels = 2, d.channels[0] = d.channels[1] = 1;
+    d.training = true;
+    assert_int_equal(gnn_unet_create(&d, &net), GNN_OK);
+    size_t floats = gnn_unet_floats(net), bytes = floats * sizeof(float);
+    file f = training_save(net);
+    unsigned char *copy = malloc(f.size);
+    float *before = malloc(3 * bytes);
+    size_t header = 8 + f.bytes[0] + 256u * f.bytes[1];
+    assert_true(copy && before && header < f.size);
+    seed(7);
+    for (int round = 0; round < 20000; ++round) {
+        memcpy(copy, f.bytes, f.size);
+        if (rng_next() % 4)
+            mutate(copy, f.size, header);
+        else
+            mutate(copy + header, f.size - header, f.size - header);
+        memcpy(before, net->weights, bytes);
+        memcpy(before + floats, net->first, 2 * bytes);
+        if (gnn_unet_load(net, copy, f.size, NULL) == GNN_OK) {
+            assert_true(gnni_all_below(net->weights, floats, INFINITY));
+            assert_true(gnni_all_below(net->first, floats, 2e15f));
+            for (size_t i = 0; i < floats; ++i)
+                assert_true(net->second[i] >= 0 && net->second[i] < 4e30f);
+            ++accepted;
+        } else {
+            assert_memory_equal(before, net->weights, bytes);
+            assert_memory_equal(before + floats, net->first, 2 * bytes);
+            ++refused;
+        }
+    }
+    assert_true(accepted > 1000 && refused > 1000); /* both ways were taken */
+    free(before);
+    free(copy);
+    free(f.bytes);
+    gnn_unet_destroy(net);
 }
 
 static void huge_headers_are_refused_and_many_tensors_read_in_time(void **state)
@@ -351,14 +420,23 @@ static void what_cannot_be_named_is_not_written(void **state)
 {
     static const char *const bad[] = {"a\"b", "a\\b", "a\nb", "\xc3\xa9", "__metadata__"};
     const char *odd[] = {"key", NULL}, *control[] = {"key", "a\tb", NULL};
+    const char *twice[] = {"key", "1", "other", "1", "key", "2", NULL};
     float value = 1;
-    gnn_weight w;
+    gnn_weight w, pair[2];
+    size_t written;
+    char buffer[256];
     (void)state;
     memset(&w, 0, sizeof w);
     w.values = &value, w.type = GNN_TYPE_F32, w.name = "ok";
     assert_true(gnn_tensors_bound(&w, 1, NULL) > 0);
     assert_int_equal(gnn_tensors_bound(&w, 1, odd), 0);
     assert_int_equal(gnn_tensors_bound(&w, 1, control), 0);
+    assert_int_equal(gnn_tensors_bound(&w, 1, twice), 0);
+    pair[0] = pair[1] = w;
+    assert_int_equal(gnn_tensors_bound(pair, 2, NULL), 0);
+    assert_int_equal(gnn_tensors_write(pair, 2, NULL, buffer, sizeof buffer, &written), GNN_BAD_RANGE);
+    pair[1].name = "okay";
+    assert_int_equal(gnn_tensors_write(pair, 2, NULL, buffer, sizeof buffer, &written), GNN_OK);
     for (size_t i = 0; i < sizeof bad / sizeof *bad; ++i) {
         w.name = bad[i];
         assert_int_equal(gnn_tensors_bound(&w, 1, NULL), 0);
@@ -380,6 +458,7 @@ int main(void)
         cmocka_unit_test(long_and_strange_names_do_not_overrun_the_message),
         cmocka_unit_test(truncated_files_are_refused),
         cmocka_unit_test(flipped_bits_and_bytes_never_overrun),
+        cmocka_unit_test(changed_saves_of_networks_load_whole_or_not_at_all),
         cmocka_unit_test(huge_headers_are_refused_and_many_tensors_read_in_time),
         cmocka_unit_test(what_cannot_be_named_is_not_written),
     };
