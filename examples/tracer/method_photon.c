@@ -6,8 +6,8 @@
    learn_alpha=ratio|variance|off (on = variance), alpha, gate=on|off, gate_margin, gate_probe, uniform, surface=on|off
    (what lies below the surface is mirrored up), jitter=on|off (find looks up a jittered position).
 
-   A pass's photons are traced before its camera paths, so the first pass has none: no voxel is valid yet. While no
-   voxel guides, only every fourth pass has some. */
+   A pass's photons are traced after its camera paths, which make voxels valid, also those that the refine before has
+   cut. While no voxel guides, only every fourth pass has some. */
 #include "method_options.h"
 
 #define GPH_IMPLEMENTATION
@@ -119,7 +119,7 @@ static uint64_t photon_wants_photons(void *method, const tr_pass *pass)
     photon *m = method;
     gph_stats s;
     gph_get_stats(m->field, &s);
-    if (pass->last || s.valid == 0 || (s.maps > 0 && gph_all_closed(m->field) && pass->index % IDLE_PASSES != 0))
+    if (pass->last || (s.maps > 0 && gph_all_closed(m->field) && pass->index % IDLE_PASSES != 0))
         return 0;
     m->flux = floor(m->per_path * m->paths * pass->spp + 0.5);
     return (uint64_t)m->flux;

@@ -583,7 +583,8 @@ typedef struct tr_method {
     void (*describe)(void *method, int n, const void *handles, float *cell, float *depth); /* for the picture layers */
     void (*set_pixel_estimate)(void *method, const tr_image *estimate);
     bool wants_pixel_estimate;
-    /* Photon paths to trace before this pass's camera paths, after begin_pass; 0 = none. */
+    /* Photon paths to trace after this pass's camera paths have been taken in, before end_pass; 0 = none. Asked only
+       where end_pass follows. */
     uint64_t (*wants_photons)(void *method, const tr_pass *pass);
     /* A tr_photon_fn: streams like record's, taken in by flush. */
     bool (*record_photons)(void *method, int tile, const tr_photon *photons, int n);
