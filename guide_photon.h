@@ -97,12 +97,13 @@
 
    MEMORY
      n = bins (rows * rows * 2). Sampling part: 16 bytes per voxel, 3 n + 8 rows + 64 per map (1.58 times its
-   half-floats), 8 per node, 24 to 48 per cube. Building part: 336 bytes per voxel; its histogram is nothing while
-   empty, a list of 16 bytes per lit bin below 256 photons, 12 n bytes above. The first pass's photons wait in 24 bytes
-   each, at most desc.cloud_photons. refine makes a new sampling part beside the old one. max_bytes bounds both parts
-   and the new one together: beyond it cubes, histograms and splits are denied and counted. Allocation happens in
-   create, stream_create, record, accumulate, refine, load; never in a query, and always from the calling thread. Stack:
-   below 140 KB per call of refine and gph_import_maps, 8 KB for others.
+     half-floats), 8 per node, 24 to 48 per cube. Building part: 336 bytes per voxel; its histogram is nothing while
+     empty, a list of 16 bytes per lit bin below 256 photons, 12 n bytes above. The first pass's photons wait in 24
+     bytes each, at most desc.cloud_photons. refine makes a new sampling part beside the old one, whose memory is kept
+     for the next; from the second on each has up to a quarter to spare. max_bytes bounds all of this together: beyond
+     it cubes, histograms and splits are denied and counted. Allocation happens in create, stream_create, record,
+     accumulate, refine, load; never in a query, and always from the calling thread. Stack: below 140 KB per call of
+     refine and gph_import_maps, 8 KB for others.
 
    THREADS: each function has a tag.
      [any thread]   pure function on constant data
@@ -711,7 +712,7 @@ GPH_API void gph_pdf_batch(const gph_view *view, uint32_t count, const uint32_t 
 #define GPHI_MAX_ROWS 64u
 #define GPHI_MAX_BINS (GPHI_MAX_ROWS * GPHI_MAX_ROWS * 2)
 #define GPHI_SPARSE 256u       /* entries from which on a histogram is dense */
-#define GPHI_BATCH 65536u      /* samples sorted at once */
+#define GPHI_BATCH 32768u      /* samples sorted at once */
 #define GPHI_NEW_LEVELS 3u     /* of a voxel in one refine [Zhu 2021a, 7.1] */
 #define GPHI_MAX_VALUE 9.9e29f /* flux or contribution from here on is a bad sample */
 #define GPHI_MAX_SUM 1e37f     /* of a bin */
@@ -1055,24 +1056,34 @@ struct gph_field {
     uint64_t first_photons;             /* N_0 */
     uint64_t pass_photons, pass_useful; /* photons seen and taken in this pass */
     uint64_t structure;
-    gphi_block *block;
-    uint32_t guiding; /* voxels of the sampling part with alpha < 1 */
+    gphi_block *block, *spare;         /* spare: the one before, to be written again; NULL = none */
+    uint64_t block_bytes, spare_bytes; /* that they have room for */
+    uint32_t guiding;                  /* voxels of the sampling part with alpha < 1 */
 };
 
 /* Bytes of both parts. */
 static uint64_t gphi_held(const gph_field *f)
 {
-    return sizeof *f + f->block->size + f->data_bytes + (uint64_t)f->cube_capacity * sizeof *f->cubes +
+    return sizeof *f + f->block_bytes + f->spare_bytes + f->data_bytes + (uint64_t)f->cube_capacity * sizeof *f->cubes +
            (uint64_t)f->slot_count * 4 + (uint64_t)f->node_capacity * sizeof *f->nodes +
            (uint64_t)f->voxel_capacity * sizeof *f->voxels + (uint64_t)f->cloud_capacity * sizeof *f->cloud;
 }
 
-/* The same when the next refine has made a sampling part, and another one is made beside it. */
+/* Give the memory for the next sampling part back. */
+static void gphi_drop_spare(gph_field *f)
+{
+    gphi_release(&f->desc, f->spare);
+    f->spare = NULL;
+    f->spare_bytes = 0;
+}
+
+/* The same when the next refines have made a sampling part and another one beside it. */
 static uint64_t gphi_bytes(const gph_field *f)
 {
     uint64_t part = (uint64_t)f->mapped * f->map_bytes + (uint64_t)f->voxel_count * sizeof(gph_voxel) +
                     (uint64_t)f->node_count * sizeof(gph_node) + (uint64_t)f->cube_count * 48 + 1024;
-    return gphi_held(f) - f->block->size + (part > f->block->size ? part : f->block->size) + part;
+    return gphi_held(f) - f->block_bytes - f->spare_bytes + (part > f->block_bytes ? part : f->block_bytes) +
+           (part > f->spare_bytes ? part : f->spare_bytes);
 }
 
 static bool gphi_fits(const gph_field *f, uint64_t more) { return gphi_bytes(f) + more <= f->desc.max_bytes; }
@@ -1399,8 +1410,7 @@ static const double gphi_gate_alpha[GPHI_GATE] = {0.2, 0.45, 0.75, 1.0};
 /* Samples on their way to their voxels. */
 typedef struct gphi_batch {
     gph_field *field;
-    const gph_vertex *vertices;
-    const gph_photon *photons;
+    const void **samples;      /* each begins with its position */
     gphi_hit *hits;            /* voxel: or GPH_NONE, GPHI_BAD, GPHI_DARK */
     uint32_t *order, *offsets; /* samples by voxel; per voxel + 1 */
     uint32_t count;
@@ -1410,10 +1420,18 @@ static bool gphi_batch_make(gphi_batch *b, gph_field *f)
 {
     memset(b, 0, sizeof *b);
     b->field = f;
-    b->hits = (gphi_hit *)gphi_allocate(&f->desc, GPHI_BATCH, sizeof *b->hits + sizeof *b->order);
-    b->order = b->hits ? (uint32_t *)(void *)(b->hits + GPHI_BATCH) : NULL;
-    return b->hits != NULL;
+    b->samples =
+        (const void **)gphi_allocate(&f->desc, GPHI_BATCH, sizeof *b->samples + sizeof *b->hits + sizeof *b->order);
+    if (!b->samples)
+        return false;
+    b->hits = (gphi_hit *)(void *)(b->samples + GPHI_BATCH);
+    b->order = (uint32_t *)(void *)(b->hits + GPHI_BATCH);
+    return true;
 }
+
+static void gphi_batch_free(gphi_batch *b) { gphi_release(&b->field->desc, (void *)(uintptr_t)b->samples); }
+
+static const float *gphi_batch_position(const gphi_batch *b, uint32_t i) { return (const float *)b->samples[i]; }
 
 /* Sort the samples by voxel, stably. */
 static bool gphi_batch_sort(gphi_batch *b)
@@ -1484,8 +1502,10 @@ static void gphi_find_vertices(void *context, uint32_t begin, uint32_t end)
 {
     gphi_batch *b = (gphi_batch *)context;
     uint32_t i;
-    for (i = begin; i < end; ++i)
-        b->hits[i].voxel = gphi_vertex_ok(&b->vertices[i]) ? gphi_find(b->field, b->vertices[i].position) : GPHI_BAD;
+    for (i = begin; i < end; ++i) {
+        const gph_vertex *v = (const gph_vertex *)b->samples[i];
+        b->hits[i].voxel = gphi_vertex_ok(v) ? gphi_find(b->field, v->position) : GPHI_BAD;
+    }
 }
 
 /* Sums of x_a = g^2 / (p p_a). pdf_bsdf is floored, for directions that the BSDF practically never draws. */
@@ -1521,21 +1541,19 @@ static void gphi_add_vertices(void *context, uint32_t begin, uint32_t end)
     uint32_t i, k;
     for (i = begin; i < end; ++i)
         for (k = b->offsets[i]; k < b->offsets[i + 1]; ++k)
-            gphi_vertex_add(&b->field->voxels[i].s.now, &b->vertices[b->order[k]],
+            gphi_vertex_add(&b->field->voxels[i].s.now, (const gph_vertex *)b->samples[b->order[k]],
                             b->field->voxels[i].s.map != GPH_NONE);
 }
 
-/* At most GPHI_BATCH vertices. */
-static gph_result gphi_take_vertices(gphi_batch *b, const gph_vertex *vertices, uint32_t count,
-                                     gph_parallel_fn parallel, void *user)
+/* The vertices of a batch. */
+static gph_result gphi_take_vertices(gphi_batch *b, gph_parallel_fn parallel, void *user)
 {
     gph_field *f = b->field;
     gph_result result = GPH_OK;
     uint32_t i;
-    b->vertices = vertices;
-    b->count = count;
-    gphi_run(parallel, user, count, 1024, gphi_find_vertices, b);
-    for (i = 0; i < count; ++i) {
+    gphi_run(parallel, user, b->count, 1024, gphi_find_vertices, b);
+    for (i = 0; i < b->count; ++i) {
+        const float *position = gphi_batch_position(b, i);
         uint32_t *voxel = &b->hits[i].voxel;
         bool denied = false;
         if (*voxel == GPHI_BAD) {
@@ -1543,16 +1561,16 @@ static gph_result gphi_take_vertices(gphi_batch *b, const gph_vertex *vertices, 
             continue;
         }
         if (*voxel == GPH_NONE) /* perhaps one before it made the cube */
-            *voxel = gphi_find(f, vertices[i].position);
+            *voxel = gphi_find(f, position);
         if (*voxel == GPH_NONE)
-            *voxel = gphi_add_cube(f, gphi_key(f, vertices[i].position), &denied);
+            *voxel = gphi_add_cube(f, gphi_key(f, position), &denied);
         if (*voxel == GPH_NONE) {
             *(denied ? &f->stats.denied : &f->stats.lost) += 1;
             result = denied ? result : GPH_OUT_OF_MEMORY;
             continue;
         }
         f->stats.vertices++;
-        f->stats.clamped += gphi_far(f, vertices[i].position);
+        f->stats.clamped += gphi_far(f, position);
         f->voxels[*voxel].s.touched++;
         f->voxels[*voxel].s.valid = 1;
     }
@@ -1571,7 +1589,7 @@ static void gphi_find_photons(void *context, uint32_t begin, uint32_t end)
     const gph_field *f = b->field;
     uint32_t i;
     for (i = begin; i < end; ++i) {
-        const gph_photon *p = &b->photons[i];
+        const gph_photon *p = (const gph_photon *)b->samples[i];
         gphi_hit *h = &b->hits[i];
         float l =
             p->direction[0] * p->direction[0] + p->direction[1] * p->direction[1] + p->direction[2] * p->direction[2];
@@ -1656,7 +1674,7 @@ static gph_result gphi_take_hits(gphi_batch *b, gph_parallel_fn parallel, void *
 static gph_result gphi_close_cloud(gphi_batch *b, gph_parallel_fn parallel, void *user);
 
 /* The hits of a batch join the cloud. False where it has no room for them. */
-static bool gphi_join_cloud(gphi_batch *b, const float *positions, size_t stride)
+static bool gphi_join_cloud(gphi_batch *b)
 {
     gph_field *f = b->field;
     gphi_cloud_photon *cloud;
@@ -1671,61 +1689,54 @@ static bool gphi_join_cloud(gphi_batch *b, const float *positions, size_t stride
     f->cloud = cloud;
     for (i = 0; i < b->count; ++i)
         if (b->hits[i].voxel < f->voxel_count) {
-            memcpy(cloud[f->cloud_count].position, (const char *)positions + stride * i, sizeof cloud->position);
+            memcpy(cloud[f->cloud_count].position, b->samples[i], sizeof cloud->position);
             cloud[f->cloud_count++].hit = b->hits[i];
         }
     return true;
 }
 
 /* Hits whose voxels are known: in the first pass to the cloud, else to the histograms. */
-static gph_result gphi_settle(gphi_batch *b, const float *positions, size_t stride, gph_parallel_fn parallel,
-                              void *user)
+static gph_result gphi_settle(gphi_batch *b, gph_parallel_fn parallel, void *user)
 {
     gph_field *f = b->field;
     gph_result result = GPH_OK, close = GPH_OK;
     uint32_t i;
     if (!f->cloud_closed) {
         gphi_batch other;
-        if (gphi_join_cloud(b, positions, stride))
+        if (gphi_join_cloud(b))
             return GPH_OK;
         if (!gphi_batch_make(&other, f)) {
             gphi_lose(b, &f->stats.photons);
             return GPH_OUT_OF_MEMORY;
         }
         close = gphi_close_cloud(&other, parallel, user);
-        gphi_release(&f->desc, other.hits);
+        gphi_batch_free(&other);
         for (i = 0; i < b->count; ++i) /* its voxel may have been cut */
-            if (b->hits[i].voxel < f->voxel_count) {
-                float p[3];
-                memcpy(p, (const char *)positions + stride * i, sizeof p);
-                b->hits[i].voxel = gphi_find(f, p);
-            }
+            if (b->hits[i].voxel < f->voxel_count)
+                b->hits[i].voxel = gphi_find(f, gphi_batch_position(b, i));
     }
     result = gphi_take_hits(b, parallel, user);
     return result ? result : close;
 }
 
-/* At most GPHI_BATCH photons. */
-static gph_result gphi_take_photons(gphi_batch *b, const gph_photon *photons, uint32_t count, gph_parallel_fn parallel,
-                                    void *user)
+/* The photons of a batch. */
+static gph_result gphi_take_photons(gphi_batch *b, gph_parallel_fn parallel, void *user)
 {
     gph_field *f = b->field;
     uint32_t i;
-    b->photons = photons;
-    b->count = count;
-    gphi_run(parallel, user, count, 1024, gphi_find_photons, b);
-    for (i = 0; i < count; ++i) {
+    gphi_run(parallel, user, b->count, 1024, gphi_find_photons, b);
+    for (i = 0; i < b->count; ++i) {
         uint32_t voxel = b->hits[i].voxel;
         bool useful = voxel < f->voxel_count;
         f->stats.refused += voxel == GPHI_BAD;
         f->stats.dark += voxel == GPHI_DARK;
         f->stats.unread += voxel == GPH_NONE;
-        f->stats.clamped += useful && gphi_far(f, photons[i].position);
+        f->stats.clamped += useful && gphi_far(f, gphi_batch_position(b, i));
         f->stats.photons += useful;
         f->pass_useful += useful;
         f->pass_photons += useful || voxel == GPH_NONE;
     }
-    return gphi_settle(b, photons->position, sizeof *photons, parallel, user);
+    return gphi_settle(b, parallel, user);
 }
 
 /* The grid's box from the vertices of all streams. */
@@ -1754,13 +1765,38 @@ static void gphi_count_lost(gph_field *f, gphi_list *list)
     list->lost = 0;
 }
 
+typedef gph_result (*gphi_take_fn)(gphi_batch *b, gph_parallel_fn parallel, void *user);
+
+static gph_result gphi_flush(gphi_batch *b, gphi_take_fn take, gph_parallel_fn parallel, void *user)
+{
+    gph_result result = b->count ? take(b, parallel, user) : GPH_OK;
+    b->count = 0;
+    return result;
+}
+
+/* Add a stream's samples to the batch, and take it in whenever it is full: a batch costs something for each voxel. */
+static gph_result gphi_gather(gphi_batch *b, gphi_list *list, size_t size, gphi_take_fn take, gph_parallel_fn parallel,
+                              void *user)
+{
+    gph_result result = GPH_OK;
+    const gphi_chunk *chunk;
+    uint32_t k;
+    gphi_count_lost(b->field, list);
+    for (chunk = list->first; chunk; chunk = chunk->next)
+        for (k = 0; k < chunk->count; ++k) {
+            b->samples[b->count++] = (const char *)(chunk + 1) + k * size;
+            if (b->count == GPHI_BATCH && gphi_flush(b, take, parallel, user))
+                result = GPH_OUT_OF_MEMORY;
+        }
+    return result;
+}
+
 GPH_API gph_result gph_accumulate(gph_field *field, gph_stream *const *streams, uint32_t count,
                                   gph_parallel_fn parallel, void *user)
 {
     gph_result result = GPH_OK;
     gphi_batch b;
-    gphi_chunk *chunk;
-    uint32_t i, k, n;
+    uint32_t i;
     if (!(field->side > 0))
         gphi_discover_box(field, streams, count);
     if (!gphi_batch_make(&b, field)) {
@@ -1771,20 +1807,17 @@ GPH_API gph_result gph_accumulate(gph_field *field, gph_stream *const *streams, 
         }
         return GPH_OUT_OF_MEMORY;
     }
-    for (i = 0; i < 2 * count; ++i) {
-        bool vertices = i < count;
-        gphi_list *list = vertices ? &streams[i]->vertices : &streams[i - count]->photons;
-        gphi_count_lost(field, list);
-        for (chunk = list->first; chunk; chunk = chunk->next)
-            for (k = 0; k < chunk->count; k += n) {
-                n = chunk->count - k < GPHI_BATCH ? chunk->count - k : GPHI_BATCH;
-                if (vertices
-                        ? gphi_take_vertices(&b, (const gph_vertex *)(const void *)(chunk + 1) + k, n, parallel, user)
-                        : gphi_take_photons(&b, (const gph_photon *)(const void *)(chunk + 1) + k, n, parallel, user))
-                    result = GPH_OUT_OF_MEMORY;
-            }
-    }
-    gphi_release(&field->desc, b.hits);
+    for (i = 0; i < count; ++i)
+        if (gphi_gather(&b, &streams[i]->vertices, sizeof(gph_vertex), gphi_take_vertices, parallel, user))
+            result = GPH_OUT_OF_MEMORY;
+    if (gphi_flush(&b, gphi_take_vertices, parallel, user))
+        result = GPH_OUT_OF_MEMORY;
+    for (i = 0; i < count; ++i)
+        if (gphi_gather(&b, &streams[i]->photons, sizeof(gph_photon), gphi_take_photons, parallel, user))
+            result = GPH_OUT_OF_MEMORY;
+    if (gphi_flush(&b, gphi_take_photons, parallel, user))
+        result = GPH_OUT_OF_MEMORY;
+    gphi_batch_free(&b);
     return result;
 }
 
@@ -2157,6 +2190,9 @@ static void gphi_compact(gph_field *f)
 {
     gphi_copy c;
     uint32_t i, cubes = 0;
+    if (gphi_held(f) + (uint64_t)f->node_count * sizeof *c.nodes + (uint64_t)f->voxel_count * sizeof *c.voxels >
+        f->desc.max_bytes)
+        gphi_drop_spare(f);
     memset(&c, 0, sizeof c);
     c.field = f;
     c.nodes = (gph_node *)gphi_allocate(&f->desc, f->node_count, sizeof *c.nodes);
@@ -2447,6 +2483,7 @@ static bool gphi_write_map(unsigned char *to, const float *map, uint32_t rows)
     scale = 32768 / most;
     for (i = 0; i < bins; ++i)
         weights[i] = map[i] > 0 ? gphi_half((float)fmin((double)map[i] * scale, 32768)) : 0;
+    memset(to + (rows + 1) * 8, 0, 56); /* between the sums of rows and of eights */
     gphi_sum_weights(to, rows, false);
     return true;
 }
@@ -2564,8 +2601,26 @@ static void gphi_publish_cubes(const gph_field *f, gphi_block *b)
     }
 }
 
-/* Header and memory of a sampling part; NULL = out of memory. */
-static gphi_block *gphi_block_make(const gph_field *f, uint32_t maps)
+/* See that the spare block has room for `size` bytes, and not for many more. After the first refine a new one has a
+   quarter more where max_bytes allows: fresh memory is slow, zeroed by the system page by page. */
+static bool gphi_spare_room(gph_field *f, uint64_t size)
+{
+    uint64_t bytes = f->stats.passes ? size + size / 4 : size;
+    if (f->spare && size <= f->spare_bytes && f->spare_bytes / 2 <= bytes)
+        return true;
+    gphi_drop_spare(f);
+    if (gphi_held(f) - f->block_bytes + (bytes > f->block_bytes ? bytes : f->block_bytes) + bytes > f->desc.max_bytes)
+        bytes = size; /* the next one is to find room too */
+    if (bytes > (uint64_t)((size_t)-1 / 2))
+        return false;
+    f->spare = (gphi_block *)f->desc.allocate(f->desc.user, (size_t)bytes);
+    f->spare_bytes = f->spare ? bytes : 0;
+    return f->spare != NULL;
+}
+
+/* Make the spare block a sampling part, with its header and cubes; voxels and maps are to be written. False = out of
+   memory. */
+static bool gphi_block_make(gph_field *f, uint32_t maps)
 {
     gphi_block shape, *b;
     memset(&shape, 0, sizeof shape);
@@ -2580,14 +2635,28 @@ static gphi_block *gphi_block_make(const gph_field *f, uint32_t maps)
     memcpy(shape.origin, f->origin, sizeof shape.origin);
     shape.side = f->side;
     gphi_block_layout(&shape);
-    b = (gphi_block *)gphi_allocate(&f->desc, shape.size, 1);
-    if (!b)
-        return NULL;
+    if (!gphi_spare_room(f, shape.size))
+        return false;
+    b = f->spare;
+    memset(b, 0, (size_t)shape.maps_at); /* gaps and free slots, so that saves are alike; maps are written in full */
     *b = shape;
     if (f->node_count)
         memcpy(gphi_part(b, b->nodes_at), f->nodes, f->node_count * sizeof *f->nodes);
     gphi_publish_cubes(f, b);
-    return b;
+    return true;
+}
+
+/* The spare block becomes the sampling part, and the other way round. */
+static void gphi_swap_blocks(gph_field *f)
+{
+    gphi_block *old = f->block;
+    uint64_t bytes = f->block_bytes;
+    f->block = f->spare;
+    f->block_bytes = f->spare_bytes;
+    f->spare = old;
+    f->spare_bytes = bytes;
+    if (bytes / 2 > f->block->size + f->block->size / 4)
+        gphi_drop_spare(f);
 }
 
 /* Make what building knows the sampling part. */
@@ -2598,9 +2667,9 @@ static gph_result gphi_publish_all(gph_field *f, gph_parallel_fn parallel, void 
     for (i = 0; i < f->voxel_count; ++i)
         maps += gphi_lit(&f->voxels[i], f->bins);
     p.field = f;
-    p.block = gphi_block_make(f, maps);
-    if (!p.block)
+    if (!gphi_block_make(f, maps))
         return GPH_OUT_OF_MEMORY;
+    p.block = f->spare;
     for (maps = i = 0; i < f->voxel_count; ++i)
         gphi_block_voxels(p.block)[i].map = gphi_lit(&f->voxels[i], f->bins) ? maps++ : GPH_NONE;
     gphi_run(parallel, user, f->voxel_count, 16, gphi_publish_maps, &p);
@@ -2614,8 +2683,7 @@ static gph_result gphi_publish_all(gph_field *f, gph_parallel_fn parallel, void 
         s->map = map;
         s->touched = 0;
     }
-    gphi_release(&f->desc, f->block);
-    f->block = p.block;
+    gphi_swap_blocks(f);
     return GPH_OK;
 }
 
@@ -2678,7 +2746,7 @@ GPH_API gph_result gph_refine(gph_field *field, gph_parallel_fn parallel, void *
         if (!gphi_batch_make(&b, field))
             return GPH_OUT_OF_MEMORY;
         result = gphi_close_cloud(&b, parallel, user);
-        gphi_release(&field->desc, b.hits);
+        gphi_batch_free(&b);
     }
     if (!field->first_photons)
         field->first_photons = field->stats.photons;
@@ -2817,11 +2885,11 @@ GPH_API gph_result gph_create(const gph_desc *desc, gph_field **field)
     gphi_field_options(f);
     if (gphi_has_bounds(&d))
         gphi_set_box(f, d.bounds_min, d.bounds_max);
-    f->block = gphi_block_make(f, 0);
-    if (!f->block) {
+    if (!gphi_block_make(f, 0)) {
         gphi_release(&d, f);
         return GPH_OUT_OF_MEMORY;
     }
+    gphi_swap_blocks(f);
     gphi_count(f);
     *field = f;
     return GPH_OK;
@@ -2842,6 +2910,7 @@ GPH_API void gph_destroy(gph_field *field)
     gphi_release(&d, field->voxels);
     gphi_release(&d, field->cloud);
     gphi_release(&d, field->block);
+    gphi_release(&d, field->spare);
     gphi_release(&d, field);
 }
 
@@ -3346,6 +3415,7 @@ static gph_result gphi_load_parts(gph_field *f, const gphi_header *h, gphi_reade
     if (h->block_size < sizeof(gphi_block) || h->block_size != r->left)
         return GPH_BAD_FILE;
     f->block = (gphi_block *)gphi_read(r, d, h->block_size, 1);
+    f->block_bytes = f->block ? h->block_size : 0;
     if (!f->block || !gphi_hash_cubes(f, h->cubes))
         return GPH_OUT_OF_MEMORY;
     return gphi_block_shape_valid(f->block, h->block_size, f) ? gph_validate(f) : GPH_BAD_FILE;
@@ -3490,12 +3560,13 @@ static gph_result gphi_merge_cloud(gph_field *f, const gph_field *g, gph_paralle
         for (k = 0; k < b.count; ++k) {
             b.hits[k] = g->cloud[i + k].hit;
             b.hits[k].voxel = gphi_find(f, g->cloud[i + k].position);
+            b.samples[k] = g->cloud[i + k].position;
             f->stats.photons += b.hits[k].voxel < f->voxel_count;
         }
-        if (gphi_settle(&b, g->cloud[i].position, sizeof *g->cloud, parallel, user))
+        if (gphi_settle(&b, parallel, user))
             result = GPH_OUT_OF_MEMORY;
     }
-    gphi_release(&f->desc, b.hits);
+    gphi_batch_free(&b);
     return result;
 }
 

@@ -1507,6 +1507,42 @@ static void test_every_failed_allocation_is_survived(void **state)
         }
 }
 
+/* A refine whose last request fails, done again, is as one that went well: nothing is judged or split twice. */
+static void test_a_failed_refine_can_be_repeated(void **state)
+{
+    (void)state;
+    gph_field *f[2];
+    counter c[2] = {{0}, {0}};
+    for (int k = 0; k < 2; ++k) {
+        gph_desc d = unit_cube();
+        gph_stream *s[2];
+        count_with(&d, &c[k]);
+        d.split_photons = 100;
+        seed(73);
+        f[k] = train(&d, 2, 1000, 10000);
+        OK(gph_stream_create(f[k], &s[0]));
+        OK(gph_stream_create(f[k], &s[1]));
+        record_pass(s, 1000, 60000);
+        OK(gph_accumulate(f[k], s, 2, NULL, NULL));
+        gph_stream_destroy(s[0]);
+        gph_stream_destroy(s[1]);
+    }
+    uint64_t splits = stats_of(f[0]).splits;
+    long before = c[0].requests;
+    OK(gph_refine(f[0], NULL, NULL));
+    assert_true(stats_of(f[0]).splits > splits + 10);
+    c[1].fail_at = c[1].requests + (c[0].requests - before); /* the sampling part */
+    assert_int_equal(gph_refine(f[1], NULL, NULL), GPH_OUT_OF_MEMORY);
+    OK(gph_validate(f[1]));
+    c[1].fail_at = 0;
+    OK(gph_refine(f[1], NULL, NULL));
+    assert_true(same_fields(f[0], f[1]));
+    for (int k = 0; k < 2; ++k) {
+        gph_destroy(f[k]);
+        assert_int_equal(c[k].live, 0);
+    }
+}
+
 static void test_queries_do_not_allocate_and_lost_samples_are_counted(void **state)
 {
     (void)state;
@@ -1745,6 +1781,7 @@ int main(void)
         cmocka_unit_test(test_validate_notices_damage),
         cmocka_unit_test(test_merge_equals_training_together),
         cmocka_unit_test(test_every_failed_allocation_is_survived),
+        cmocka_unit_test(test_a_failed_refine_can_be_repeated),
         cmocka_unit_test(test_queries_do_not_allocate_and_lost_samples_are_counted),
         cmocka_unit_test(test_gate_closes_where_guiding_does_not_pay_and_opens_where_it_does),
         cmocka_unit_test(test_ratio_alpha_is_equation_14),
