@@ -295,8 +295,7 @@ typedef struct tr_scene {
     int *environment; /* ids of envmap, constant and sun lights */
     int environment_count;
     float *light_cdf; /* [light_count + 1] */
-    float
-        *power_cdf; /* [light_count + 1], by power alone: which light a photon comes from; within light_cdf's memory */
+    float *power_cdf; /* [light_count + 1], by power alone, for photons; within light_cdf's memory */
     uint64_t triangles;
     RTCDevice device;
     RTCScene rtc;
@@ -424,8 +423,8 @@ typedef struct tr_emission {
 } tr_emission;
 
 /* Draw a ray that leaves a light: the light by power, a point on it by area, a direction by cosine or by the
-   environment map; those without a place shine on the disk that the scene's bounding sphere shows them. u in [0,1)^5:
-   light, place, direction. False = none (no light has power, or a spot's rim). */
+   environment map; those without a place shine through the shadow of the scene's bounding box. u in [0,1)^5: light,
+   place, direction. False = none (no light has power, or a spot's rim). */
 bool tr_light_emit(const tr_scene *scene, const float u[5], tr_emission *emission);
 
 /* ---- >>vertex ----------------------------------------------------------------------------------------------- */
