@@ -472,9 +472,9 @@ typedef struct tr_photon {
     uint32_t flags; /* TR_PHOTON_..., 0 = what a guided direction from p can find */
 } tr_photon;
 #define TR_PHOTON_DIRECT 1u /* straight from a light, which next event estimation samples */
-#define TR_PHOTON_UNSEEN                                                                                               \
-    2u /* light that no camera path gathers: a point's, spot's or directional light's through glass                    \
-          or mirrors, or any of theirs without next event estimation */
+/* Light that no camera path gathers: a point's, spot's or directional light's through glass or mirrors, or any of
+   theirs without next event estimation. */
+#define TR_PHOTON_UNSEEN 2u
 
 /* Photon paths first .. first + count - 1 of pass `index`, whose paths are `total`. */
 typedef struct tr_photon_pass {
