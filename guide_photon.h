@@ -59,8 +59,8 @@
 
      What is learned is the histogram after desc.repair, the classical filters of Table 1 that need no network, or the
      map that gph_import_maps wrote in its place. The Gaussian's width is chosen for each map by what its photons say of
-     each other. Filters know that phi wraps and that the way over a pole goes on at
-     phi + pi.
+     each other. Filters know that phi wraps and that the way over a pole goes on at phi + pi. A map is made anew when a
+     third of its voxel's photons are new to it, that of a closed voxel (see Gate) not before it is tried again.
 
      Splits: a voxel that has seen more photons than split_photons sqrt(N / N_0) is halved, at most 3 levels a refine;
      N = photons so far, N_0 = of the first pass. (The paper has sqrt(2^t) in pass t, which is the same where passes
@@ -78,7 +78,8 @@
                            selection probability a: g contribution, p what the direction was drawn with, p_a =
                            a pdf_bsdf + (1 - a) pdf_guide.
      Gate: a voxel closes (alpha 1) when its vertices show with 95 % confidence that V(1) <= (1 + gate_margin) V(a) for
-     the best a; it is tried again after gate_probe passes and closes again at twice the margin only where that holds.
+     the best a. An open voxel closes at half the margin; a closed one is tried again after gate_probe passes, with its
+     evidence dropped.
 
      With a normal, gph_find mirrors what lies below the surface up: p'(w) = p(w) + p(mirrored w), which is exact. There
      is no product with the cosine: photons already arrive with it.
@@ -90,18 +91,19 @@
      gph_photon: one per hit of a photon on a non-delta surface. direction: to where it came from. flux: mean over
      channels of its path's power, W; not divided by the number of paths of the pass, so that paths of all passes count
      alike. With next-event estimation leave out photons straight from a light that it samples.
-     A pass's vertices go to accumulate before its photons or together with them.
+     A pass's vertices go to accumulate before its photons or together with them: after a split they make halves valid.
 
    OPTIONS: see gph_desc. gph_resolve fills in defaults, gph_get_desc returns what a field uses.
 
    MEMORY
      n = bins (rows * rows * 2). Sampling part: 16 bytes per voxel, 3 n + 8 rows + 64 per map (1.58 times its
-   half-floats), 8 per node, 24 to 48 per cube. Building part: 336 bytes per voxel; its histogram is nothing while
-   empty, a list of 16 bytes per lit bin below 256 photons, 12 n bytes above. The first pass's photons wait in 24 bytes
-   each, at most desc.cloud_photons. refine makes a new sampling part beside the old one. max_bytes bounds both parts
-   and the new one together: beyond it cubes, histograms and splits are denied and counted. Allocation happens in
-   create, stream_create, record, accumulate, refine, load; never in a query, and always from the calling thread. Stack:
-   below 140 KB per call of refine and gph_import_maps, 8 KB for others.
+     half-floats), 8 per node, 24 to 48 per cube. Building part: 336 bytes per voxel; its histogram is nothing while
+     empty, a list of 16 bytes per lit bin below 256 photons, 12 n bytes above. The first pass's photons wait in 24
+     bytes each, at most desc.cloud_photons. refine makes a new sampling part beside the old one, whose memory is kept
+     for the next; from the second on each has up to a quarter to spare. max_bytes bounds all of this together: beyond
+     it cubes, histograms and splits are denied and counted. Allocation happens in create, stream_create, record,
+     accumulate, refine, load; never in a query, and always from the calling thread. Stack: below 140 KB per call of
+     refine and gph_import_maps, 8 KB for others.
 
    THREADS: each function has a tag.
      [any thread]   pure function on constant data
@@ -114,12 +116,13 @@
      gph_result, 0 = ok; gph_result_string says which field to change. Asserts (GPH_ASSERT) catch programming errors.
      Bad samples (NaN, infinity, negative, >= 1e30, pdf_mix <= 0, zero direction, distance <= 0 or NaN) are refused and
      counted in gph_stats. A failed allocation leaves the field as it was before the call, except that samples that
-   found no memory are lost (counted). gph_load checks size, version, byte order, checksum and every index before use.
+     found no memory are lost (counted). gph_load checks size, version, byte order, checksum and every index before use.
 
    NUMERICAL LIMITS
      Cubes are numbered within +-2^20 of the box's lower corner on each axis; what lies farther out shares the outermost
      cubes (counted as clamped). Flux of a bin adds up in f32, pass by pass; it saturates at 1e37, photon numbers of a
-     bin at 65535 a pass. A map spans 2^40 between its largest and its smallest bin that is not zero.
+     bin at 65535 a pass. A voxel needs a bin of more than 1e-30 W for a map. A map spans 2^40 between its largest and
+   its smallest bin that is not zero.
 
    REFERENCES
      S. Zhu, Z. Xu, T. Sun, A. Kuznetsov, M. Meyer, H. W. Jensen, H. Su, R. Ramamoorthi 2021a, Photon-Driven Neural
@@ -251,7 +254,7 @@ typedef struct gph_stats {
     uint64_t splits;         /* voxels cut in two */
     uint64_t recycled;       /* voxels emptied because no camera path came */
     uint64_t built;          /* maps made from histograms */
-    uint64_t skipped;        /* maps kept: no new photons since the last refine */
+    uint64_t skipped;        /* maps kept: fewer than a third of the photons are new to them */
     uint64_t imported;       /* maps written by gph_import_maps */
     uint64_t opened, closed; /* verdicts of the gate so far */
     uint64_t probed;         /* closed voxels tried again so far */
@@ -344,7 +347,8 @@ GPH_API gph_result gph_record_photons(gph_stream *stream, const gph_photon *phot
 GPH_API gph_result gph_accumulate(gph_field *field, gph_stream *const *streams, uint32_t count,
                                   gph_parallel_fn parallel, void *user);
 /* A pass has ended: judge, split, recycle, then make what was learned the sampling part. Handles and views become
-   invalid. On failure the sampling part stays; it may be called again. [exclusive] */
+   invalid. On failure the sampling part stays; it may be called again: what was judged, split and recycled by then is
+   not done twice. [exclusive] */
 GPH_API gph_result gph_refine(gph_field *field, gph_parallel_fn parallel, void *user);
 
 /* True when no voxel guides: a renderer may skip every query until the next refine. [any thread] */
@@ -359,7 +363,7 @@ GPH_API gph_result gph_validate(const gph_field *field);
 /* ---- >>maps ------------------------------------------------------------------------------------------------- */
 
 /* For networks that repair histograms, between refine and the next accumulate. Plain arrays; the result of the network
-   replaces what desc.repair made, until the voxel gets new photons. */
+   replaces what desc.repair made, until a third of the voxel's photons are new. */
 
 /* Write to voxels (NULL = only count) the voxels whose maps the last refine made anew and that a camera path touched in
    the pass before: those worth a network's time. Returns their number; writes at most capacity. [any thread] */
@@ -517,13 +521,14 @@ GPH_QUERY uint64_t gph_weight(uint16_t half)
 /* Bin of a direction (unit). NaN lands in a bin too. */
 GPH_QUERY uint32_t gph_bin(uint32_t rows, uint32_t columns, const float direction[3])
 {
-    float z = (direction[2] + 1) * (0.5f * (float)rows), phi = atan2f(direction[1], direction[0]), c;
+    float z = (direction[2] + 1) * (0.5f * (float)rows);
+    double phi = (double)atan2f(direction[1], direction[0]), c; /* turns and bins in double: no more rounding */
     z = z > 0 ? z : 0;
     z = z < (float)(rows - 1) ? z : (float)(rows - 1);
-    phi = phi < 0 ? phi + 2 * GPH_PI : phi;
-    c = phi * ((float)columns / (2 * GPH_PI));
+    phi = phi < 0 ? phi + 6.28318530717958648 : phi;
+    c = phi * (columns * 0.159154943091895336);
     c = c > 0 ? c : 0;
-    c = c < (float)(columns - 1) ? c : (float)(columns - 1);
+    c = c < columns - 1 ? c : columns - 1;
     return (uint32_t)z * columns + (uint32_t)c;
 }
 
@@ -579,6 +584,14 @@ GPH_QUERY uint32_t gph_search(const gph_handle *handle, const uint64_t *sums, ui
     return low;
 }
 
+/* Where in a bin, 0 .. 1: not on its edges, where rounding would carry a direction into the next bin, whose density may
+   be far lower. So directions within 2e-5 of a bin's width come to lie at that distance. */
+GPH_QUERY double gph_inside(double v)
+{
+    v = v > 2e-5 ? v : 2e-5;
+    return v < 1 - 2e-5 ? v : 1 - 2e-5;
+}
+
 /* Direction (unit) from u in [0, 1)^2: z grows with u[0], and phi with u[1] where z stays in one row of bins (so before
    mirroring). Returns the density of the direction after rounding. [any thread] */
 GPH_QUERY float gph_sample(const gph_handle *handle, const float u[2], float direction[3])
@@ -586,12 +599,12 @@ GPH_QUERY float gph_sample(const gph_handle *handle, const float u[2], float dir
     float z = 2 * u[0] - 1, phi = 2 * GPH_PI * u[1], r;
     if (handle->weights) {
         uint32_t blocks = handle->columns / 8, row, block, bin, j;
-        double x, low, mass, part, each = (double)handle->uniform / (double)(handle->rows * handle->columns), p = 0, v;
+        double x, low, mass, part, each = (double)handle->uniform / (double)(handle->rows * handle->columns), p = 0,
+                                   turn;
         row = gph_search(handle, handle->sums, 0, handle->rows, handle->columns, (double)u[0]);
         low = gph_until(handle, handle->sums, row, handle->columns);
         mass = gph_until(handle, handle->sums, row + 1, handle->columns) - low;
-        v = ((double)u[0] - low) / mass;
-        z = (float)(2 * (row + (v < 1 ? v : 1)) / handle->rows - 1);
+        z = (float)(2 * (row + gph_inside(((double)u[0] - low) / mass)) / handle->rows - 1);
         x = low + (double)u[1] * mass;
         block = gph_search(handle, handle->blocks, row * blocks, blocks, 8, x);
         part = x - gph_until(handle, handle->blocks, block, 8);
@@ -602,9 +615,8 @@ GPH_QUERY float gph_sample(const gph_handle *handle, const float u[2], float dir
             part -= p;
         }
         bin = block * 8 + j - row * handle->columns;
-        v = part / p;
-        v = v > 0 ? v : 0;
-        phi = (float)(2 * 3.14159265358979324 * (bin + (v < 1 ? v : 1)) / handle->columns);
+        turn = (bin + gph_inside(part / p)) / handle->columns;
+        phi = (float)(6.28318530717958648 * (turn < 0.5 ? turn : turn - 1)); /* -pi .. pi: floats are finer there */
     }
     r = 1 - z * z;
     r = sqrtf(r > 0 ? r : 0);
@@ -700,10 +712,11 @@ GPH_API void gph_pdf_batch(const gph_view *view, uint32_t count, const uint32_t 
 #define GPHI_MAX_ROWS 64u
 #define GPHI_MAX_BINS (GPHI_MAX_ROWS * GPHI_MAX_ROWS * 2)
 #define GPHI_SPARSE 256u       /* entries from which on a histogram is dense */
-#define GPHI_BATCH 65536u      /* samples sorted at once */
+#define GPHI_BATCH 32768u      /* samples sorted at once */
 #define GPHI_NEW_LEVELS 3u     /* of a voxel in one refine [Zhu 2021a, 7.1] */
 #define GPHI_MAX_VALUE 9.9e29f /* flux or contribution from here on is a bad sample */
 #define GPHI_MAX_SUM 1e37f     /* of a bin */
+#define GPHI_MIN_LIT 1e-30f    /* a histogram without a bin above this has no map: filters would underflow */
 #define GPHI_MAX_ROOT 1e15     /* contributions are clamped to this before squaring */
 #define GPHI_CONFIDENCE 1.645  /* one-sided 95 % of the normal distribution */
 #define GPHI_MIN_CLOSE 64.0    /* effective samples for the verdict "does not pay" */
@@ -801,13 +814,13 @@ typedef struct gphi_state {
     uint32_t level;      /* of the leaf in its cube's tree */
     uint32_t touched;    /* vertices in this pass */
     uint32_t unread;     /* passes without a vertex */
-    uint32_t fresh;      /* photons in this pass */
+    uint32_t fresh;      /* photons since `map` was made, half of the parents' counted */
     uint32_t valid;      /* takes photons */
     uint32_t form;       /* gphi_form */
     uint32_t entries;    /* of a list */
     uint32_t rolled;     /* pass whose photons `now` of the histogram holds */
     uint32_t map;        /* in the sampling part; GPH_NONE */
-    uint32_t changed;    /* bit 0: photons since that map was made; 1: the last refine made it, and it is read */
+    uint32_t changed;    /* bit 0: photons since `map` was made; 1: the last refine made it, and it is read */
     uint32_t verdict;    /* GPH_GATE_... */
     uint32_t probe;      /* closed: passes until the next try */
     uint32_t blocked;    /* found no memory: passing */
@@ -825,7 +838,7 @@ typedef struct gphi_voxel {
     gphi_state s;
     void *data;        /* gphi_entry [capacity], or float old[n], now[n], uint16_t count_old[n], count_now[n] */
     uint32_t capacity; /* of a list */
-    uint32_t spare;
+    uint32_t sigma;    /* 1 + index of the Gaussian's sigma that was chosen last; 0 = none */
 } gphi_voxel;
 
 typedef struct gphi_dense {
@@ -954,6 +967,7 @@ static void gphi_halve(gphi_voxel *v, uint32_t bins)
         *b.count_now = (uint16_t)((*b.count_now + 1) / 2);
     }
     v->s.photons *= 0.5;
+    v->s.fresh /= 2;
 }
 
 /* Give a voxel room for `more` entries. bytes: what that took. False: out of memory, nothing changed. */
@@ -1036,29 +1050,40 @@ struct gph_field {
     gphi_cloud_photon *cloud;
     uint32_t cloud_count, cloud_capacity;
     uint32_t cloud_closed;
+    uint32_t judged;                    /* a refine could not publish: its other steps are done */
     uint32_t mapped;                    /* voxels with a histogram */
     uint64_t data_bytes;                /* of histograms */
     uint64_t first_photons;             /* N_0 */
     uint64_t pass_photons, pass_useful; /* photons seen and taken in this pass */
     uint64_t structure;
-    gphi_block *block;
-    uint32_t guiding; /* voxels of the sampling part with alpha < 1 */
+    gphi_block *block, *spare;         /* spare: the one before, to be written again; NULL = none */
+    uint64_t block_bytes, spare_bytes; /* that they have room for */
+    uint32_t guiding;                  /* voxels of the sampling part with alpha < 1 */
 };
 
 /* Bytes of both parts. */
 static uint64_t gphi_held(const gph_field *f)
 {
-    return sizeof *f + f->block->size + f->data_bytes + (uint64_t)f->cube_capacity * sizeof *f->cubes +
+    return sizeof *f + f->block_bytes + f->spare_bytes + f->data_bytes + (uint64_t)f->cube_capacity * sizeof *f->cubes +
            (uint64_t)f->slot_count * 4 + (uint64_t)f->node_capacity * sizeof *f->nodes +
            (uint64_t)f->voxel_capacity * sizeof *f->voxels + (uint64_t)f->cloud_capacity * sizeof *f->cloud;
 }
 
-/* The same when the next refine has made a sampling part, and another one is made beside it. */
+/* Give the memory for the next sampling part back. */
+static void gphi_drop_spare(gph_field *f)
+{
+    gphi_release(&f->desc, f->spare);
+    f->spare = NULL;
+    f->spare_bytes = 0;
+}
+
+/* The same when the next refines have made a sampling part and another one beside it. */
 static uint64_t gphi_bytes(const gph_field *f)
 {
     uint64_t part = (uint64_t)f->mapped * f->map_bytes + (uint64_t)f->voxel_count * sizeof(gph_voxel) +
                     (uint64_t)f->node_count * sizeof(gph_node) + (uint64_t)f->cube_count * 48 + 1024;
-    return gphi_held(f) - f->block->size + (part > f->block->size ? part : f->block->size) + part;
+    return gphi_held(f) - f->block_bytes - f->spare_bytes + (part > f->block_bytes ? part : f->block_bytes) +
+           (part > f->spare_bytes ? part : f->spare_bytes);
 }
 
 static bool gphi_fits(const gph_field *f, uint64_t more) { return gphi_bytes(f) + more <= f->desc.max_bytes; }
@@ -1201,8 +1226,8 @@ static void gphi_set_box(gph_field *f, const float low[3], const float high[3])
     f->side = fmax(extent / f->desc.grid_cells, fmax(far * 1.2e-7, 1e-30));
 }
 
-/* Cut a leaf in two. The lower half keeps the voxel, the upper one is a new one; both inherit half of the sums.
-   copy: the histogram goes to both halves too. */
+/* Cut a leaf in two. The lower half keeps the voxel, the upper one is a new one; both inherit half of the sums and of
+   the histogram, and the map. */
 static gph_result gphi_cut(gph_field *f, uint32_t node, uint32_t axis, float split)
 {
     uint32_t low = f->nodes[node].link & ~GPH_LEAF, k;
@@ -1385,8 +1410,7 @@ static const double gphi_gate_alpha[GPHI_GATE] = {0.2, 0.45, 0.75, 1.0};
 /* Samples on their way to their voxels. */
 typedef struct gphi_batch {
     gph_field *field;
-    const gph_vertex *vertices;
-    const gph_photon *photons;
+    const void **samples;      /* each begins with its position */
     gphi_hit *hits;            /* voxel: or GPH_NONE, GPHI_BAD, GPHI_DARK */
     uint32_t *order, *offsets; /* samples by voxel; per voxel + 1 */
     uint32_t count;
@@ -1396,10 +1420,18 @@ static bool gphi_batch_make(gphi_batch *b, gph_field *f)
 {
     memset(b, 0, sizeof *b);
     b->field = f;
-    b->hits = (gphi_hit *)gphi_allocate(&f->desc, GPHI_BATCH, sizeof *b->hits + sizeof *b->order);
-    b->order = b->hits ? (uint32_t *)(void *)(b->hits + GPHI_BATCH) : NULL;
-    return b->hits != NULL;
+    b->samples =
+        (const void **)gphi_allocate(&f->desc, GPHI_BATCH, sizeof *b->samples + sizeof *b->hits + sizeof *b->order);
+    if (!b->samples)
+        return false;
+    b->hits = (gphi_hit *)(void *)(b->samples + GPHI_BATCH);
+    b->order = (uint32_t *)(void *)(b->hits + GPHI_BATCH);
+    return true;
 }
+
+static void gphi_batch_free(gphi_batch *b) { gphi_release(&b->field->desc, (void *)(uintptr_t)b->samples); }
+
+static const float *gphi_batch_position(const gphi_batch *b, uint32_t i) { return (const float *)b->samples[i]; }
 
 /* Sort the samples by voxel, stably. */
 static bool gphi_batch_sort(gphi_batch *b)
@@ -1470,8 +1502,10 @@ static void gphi_find_vertices(void *context, uint32_t begin, uint32_t end)
 {
     gphi_batch *b = (gphi_batch *)context;
     uint32_t i;
-    for (i = begin; i < end; ++i)
-        b->hits[i].voxel = gphi_vertex_ok(&b->vertices[i]) ? gphi_find(b->field, b->vertices[i].position) : GPHI_BAD;
+    for (i = begin; i < end; ++i) {
+        const gph_vertex *v = (const gph_vertex *)b->samples[i];
+        b->hits[i].voxel = gphi_vertex_ok(v) ? gphi_find(b->field, v->position) : GPHI_BAD;
+    }
 }
 
 /* Sums of x_a = g^2 / (p p_a). pdf_bsdf is floored, for directions that the BSDF practically never draws. */
@@ -1507,21 +1541,19 @@ static void gphi_add_vertices(void *context, uint32_t begin, uint32_t end)
     uint32_t i, k;
     for (i = begin; i < end; ++i)
         for (k = b->offsets[i]; k < b->offsets[i + 1]; ++k)
-            gphi_vertex_add(&b->field->voxels[i].s.now, &b->vertices[b->order[k]],
+            gphi_vertex_add(&b->field->voxels[i].s.now, (const gph_vertex *)b->samples[b->order[k]],
                             b->field->voxels[i].s.map != GPH_NONE);
 }
 
-/* At most GPHI_BATCH vertices. */
-static gph_result gphi_take_vertices(gphi_batch *b, const gph_vertex *vertices, uint32_t count,
-                                     gph_parallel_fn parallel, void *user)
+/* The vertices of a batch. */
+static gph_result gphi_take_vertices(gphi_batch *b, gph_parallel_fn parallel, void *user)
 {
     gph_field *f = b->field;
     gph_result result = GPH_OK;
     uint32_t i;
-    b->vertices = vertices;
-    b->count = count;
-    gphi_run(parallel, user, count, 1024, gphi_find_vertices, b);
-    for (i = 0; i < count; ++i) {
+    gphi_run(parallel, user, b->count, 1024, gphi_find_vertices, b);
+    for (i = 0; i < b->count; ++i) {
+        const float *position = gphi_batch_position(b, i);
         uint32_t *voxel = &b->hits[i].voxel;
         bool denied = false;
         if (*voxel == GPHI_BAD) {
@@ -1529,16 +1561,16 @@ static gph_result gphi_take_vertices(gphi_batch *b, const gph_vertex *vertices, 
             continue;
         }
         if (*voxel == GPH_NONE) /* perhaps one before it made the cube */
-            *voxel = gphi_find(f, vertices[i].position);
+            *voxel = gphi_find(f, position);
         if (*voxel == GPH_NONE)
-            *voxel = gphi_add_cube(f, gphi_key(f, vertices[i].position), &denied);
+            *voxel = gphi_add_cube(f, gphi_key(f, position), &denied);
         if (*voxel == GPH_NONE) {
             *(denied ? &f->stats.denied : &f->stats.lost) += 1;
             result = denied ? result : GPH_OUT_OF_MEMORY;
             continue;
         }
         f->stats.vertices++;
-        f->stats.clamped += gphi_far(f, vertices[i].position);
+        f->stats.clamped += gphi_far(f, position);
         f->voxels[*voxel].s.touched++;
         f->voxels[*voxel].s.valid = 1;
     }
@@ -1557,7 +1589,7 @@ static void gphi_find_photons(void *context, uint32_t begin, uint32_t end)
     const gph_field *f = b->field;
     uint32_t i;
     for (i = begin; i < end; ++i) {
-        const gph_photon *p = &b->photons[i];
+        const gph_photon *p = (const gph_photon *)b->samples[i];
         gphi_hit *h = &b->hits[i];
         float l =
             p->direction[0] * p->direction[0] + p->direction[1] * p->direction[1] + p->direction[2] * p->direction[2];
@@ -1642,7 +1674,7 @@ static gph_result gphi_take_hits(gphi_batch *b, gph_parallel_fn parallel, void *
 static gph_result gphi_close_cloud(gphi_batch *b, gph_parallel_fn parallel, void *user);
 
 /* The hits of a batch join the cloud. False where it has no room for them. */
-static bool gphi_join_cloud(gphi_batch *b, const float *positions, size_t stride)
+static bool gphi_join_cloud(gphi_batch *b)
 {
     gph_field *f = b->field;
     gphi_cloud_photon *cloud;
@@ -1657,61 +1689,54 @@ static bool gphi_join_cloud(gphi_batch *b, const float *positions, size_t stride
     f->cloud = cloud;
     for (i = 0; i < b->count; ++i)
         if (b->hits[i].voxel < f->voxel_count) {
-            memcpy(cloud[f->cloud_count].position, (const char *)positions + stride * i, sizeof cloud->position);
+            memcpy(cloud[f->cloud_count].position, b->samples[i], sizeof cloud->position);
             cloud[f->cloud_count++].hit = b->hits[i];
         }
     return true;
 }
 
 /* Hits whose voxels are known: in the first pass to the cloud, else to the histograms. */
-static gph_result gphi_settle(gphi_batch *b, const float *positions, size_t stride, gph_parallel_fn parallel,
-                              void *user)
+static gph_result gphi_settle(gphi_batch *b, gph_parallel_fn parallel, void *user)
 {
     gph_field *f = b->field;
     gph_result result = GPH_OK, close = GPH_OK;
     uint32_t i;
     if (!f->cloud_closed) {
         gphi_batch other;
-        if (gphi_join_cloud(b, positions, stride))
+        if (gphi_join_cloud(b))
             return GPH_OK;
         if (!gphi_batch_make(&other, f)) {
             gphi_lose(b, &f->stats.photons);
             return GPH_OUT_OF_MEMORY;
         }
         close = gphi_close_cloud(&other, parallel, user);
-        gphi_release(&f->desc, other.hits);
+        gphi_batch_free(&other);
         for (i = 0; i < b->count; ++i) /* its voxel may have been cut */
-            if (b->hits[i].voxel < f->voxel_count) {
-                float p[3];
-                memcpy(p, (const char *)positions + stride * i, sizeof p);
-                b->hits[i].voxel = gphi_find(f, p);
-            }
+            if (b->hits[i].voxel < f->voxel_count)
+                b->hits[i].voxel = gphi_find(f, gphi_batch_position(b, i));
     }
     result = gphi_take_hits(b, parallel, user);
     return result ? result : close;
 }
 
-/* At most GPHI_BATCH photons. */
-static gph_result gphi_take_photons(gphi_batch *b, const gph_photon *photons, uint32_t count, gph_parallel_fn parallel,
-                                    void *user)
+/* The photons of a batch. */
+static gph_result gphi_take_photons(gphi_batch *b, gph_parallel_fn parallel, void *user)
 {
     gph_field *f = b->field;
     uint32_t i;
-    b->photons = photons;
-    b->count = count;
-    gphi_run(parallel, user, count, 1024, gphi_find_photons, b);
-    for (i = 0; i < count; ++i) {
+    gphi_run(parallel, user, b->count, 1024, gphi_find_photons, b);
+    for (i = 0; i < b->count; ++i) {
         uint32_t voxel = b->hits[i].voxel;
         bool useful = voxel < f->voxel_count;
         f->stats.refused += voxel == GPHI_BAD;
         f->stats.dark += voxel == GPHI_DARK;
         f->stats.unread += voxel == GPH_NONE;
-        f->stats.clamped += useful && gphi_far(f, photons[i].position);
+        f->stats.clamped += useful && gphi_far(f, gphi_batch_position(b, i));
         f->stats.photons += useful;
         f->pass_useful += useful;
         f->pass_photons += useful || voxel == GPH_NONE;
     }
-    return gphi_settle(b, photons->position, sizeof *photons, parallel, user);
+    return gphi_settle(b, parallel, user);
 }
 
 /* The grid's box from the vertices of all streams. */
@@ -1740,13 +1765,38 @@ static void gphi_count_lost(gph_field *f, gphi_list *list)
     list->lost = 0;
 }
 
+typedef gph_result (*gphi_take_fn)(gphi_batch *b, gph_parallel_fn parallel, void *user);
+
+static gph_result gphi_flush(gphi_batch *b, gphi_take_fn take, gph_parallel_fn parallel, void *user)
+{
+    gph_result result = b->count ? take(b, parallel, user) : GPH_OK;
+    b->count = 0;
+    return result;
+}
+
+/* Add a stream's samples to the batch, and take it in whenever it is full: a batch costs something for each voxel. */
+static gph_result gphi_gather(gphi_batch *b, gphi_list *list, size_t size, gphi_take_fn take, gph_parallel_fn parallel,
+                              void *user)
+{
+    gph_result result = GPH_OK;
+    const gphi_chunk *chunk;
+    uint32_t k;
+    gphi_count_lost(b->field, list);
+    for (chunk = list->first; chunk; chunk = chunk->next)
+        for (k = 0; k < chunk->count; ++k) {
+            b->samples[b->count++] = (const char *)(chunk + 1) + k * size;
+            if (b->count == GPHI_BATCH && gphi_flush(b, take, parallel, user))
+                result = GPH_OUT_OF_MEMORY;
+        }
+    return result;
+}
+
 GPH_API gph_result gph_accumulate(gph_field *field, gph_stream *const *streams, uint32_t count,
                                   gph_parallel_fn parallel, void *user)
 {
     gph_result result = GPH_OK;
     gphi_batch b;
-    gphi_chunk *chunk;
-    uint32_t i, k, n;
+    uint32_t i;
     if (!(field->side > 0))
         gphi_discover_box(field, streams, count);
     if (!gphi_batch_make(&b, field)) {
@@ -1757,20 +1807,17 @@ GPH_API gph_result gph_accumulate(gph_field *field, gph_stream *const *streams, 
         }
         return GPH_OUT_OF_MEMORY;
     }
-    for (i = 0; i < 2 * count; ++i) {
-        bool vertices = i < count;
-        gphi_list *list = vertices ? &streams[i]->vertices : &streams[i - count]->photons;
-        gphi_count_lost(field, list);
-        for (chunk = list->first; chunk; chunk = chunk->next)
-            for (k = 0; k < chunk->count; k += n) {
-                n = chunk->count - k < GPHI_BATCH ? chunk->count - k : GPHI_BATCH;
-                if (vertices
-                        ? gphi_take_vertices(&b, (const gph_vertex *)(const void *)(chunk + 1) + k, n, parallel, user)
-                        : gphi_take_photons(&b, (const gph_photon *)(const void *)(chunk + 1) + k, n, parallel, user))
-                    result = GPH_OUT_OF_MEMORY;
-            }
-    }
-    gphi_release(&field->desc, b.hits);
+    for (i = 0; i < count; ++i)
+        if (gphi_gather(&b, &streams[i]->vertices, sizeof(gph_vertex), gphi_take_vertices, parallel, user))
+            result = GPH_OUT_OF_MEMORY;
+    if (gphi_flush(&b, gphi_take_vertices, parallel, user))
+        result = GPH_OUT_OF_MEMORY;
+    for (i = 0; i < count; ++i)
+        if (gphi_gather(&b, &streams[i]->photons, sizeof(gph_photon), gphi_take_photons, parallel, user))
+            result = GPH_OUT_OF_MEMORY;
+    if (gphi_flush(&b, gphi_take_photons, parallel, user))
+        result = GPH_OUT_OF_MEMORY;
+    gphi_batch_free(&b);
     return result;
 }
 
@@ -2143,6 +2190,9 @@ static void gphi_compact(gph_field *f)
 {
     gphi_copy c;
     uint32_t i, cubes = 0;
+    if (gphi_held(f) + (uint64_t)f->node_count * sizeof *c.nodes + (uint64_t)f->voxel_count * sizeof *c.voxels >
+        f->desc.max_bytes)
+        gphi_drop_spare(f);
     memset(&c, 0, sizeof c);
     c.field = f;
     c.nodes = (gph_node *)gphi_allocate(&f->desc, f->node_count, sizeof *c.nodes);
@@ -2186,7 +2236,7 @@ static void gphi_recycle(gph_field *f)
         f->data_bytes -= gphi_data_bytes(v, f->bins);
         gphi_release(&f->desc, v->data);
         v->data = NULL;
-        v->capacity = 0;
+        v->capacity = v->sigma = 0;
         {
             uint32_t level = v->s.level, unread = v->s.unread;
             gphi_state_init(&v->s, f->desc.alpha, f->stats.passes);
@@ -2256,35 +2306,50 @@ static float gphi_blur(float *a, float *b, int rows, int columns, double sigma)
     return k[0];
 }
 
-/* Sigma of the Gaussian under which each photon is most likely given all others: sum over bins of flux times
-   log of (1 - e) (b - k^2 w) / (sum - w) + e / bins, b the blurred histogram, k the kernel's middle, w the mean flux of
-   the bin's photons. Leave-one-out cross-validation, own. map: the histogram; its second half and scratch are lost. */
-static double gphi_choose_sigma(const gph_field *f, const gphi_voxel *v, float *map, float *scratch)
+/* How likely a blur makes each photon given all others: sum over bins of flux times log of (1 - e) (b - k^2 w) /
+   (sum - w) + e / bins, b the blurred histogram, k the kernel's middle, w the mean flux of the bin's photons.
+   Leave-one-out cross-validation, own. map: the histogram, whose sum is `sum`; its second half and scratch are lost. */
+static double gphi_likelihood(const gph_field *f, const gphi_voxel *v, float *map, float *scratch, double sum,
+                              double sigma)
 {
-    static const double sigmas[] = {0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0};
-    int rows = (int)f->desc.rows, s;
+    int rows = (int)f->desc.rows;
     uint32_t i, n = gphi_bins(v, f->bins);
-    double best = -INFINITY, sigma = 1, sum = 0, e = (double)f->desc.uniform;
+    double likely = 0, middle, e = (double)f->desc.uniform;
+    memcpy(map + f->bins, map, f->bins * sizeof *map);
+    middle = (double)gphi_blur(map + f->bins, scratch, rows, 2 * rows, sigma);
+    for (i = 0; i < n; ++i) {
+        gphi_bin b = gphi_get_bin(v, f->bins, i);
+        double flux = (double)map[b.at], one = flux / ((double)*b.count_old + *b.count_now), others;
+        if (!(flux > 0))
+            continue;
+        others = ((double)map[f->bins + b.at] - middle * middle * one) / fmax(sum - one, 1e-9 * sum);
+        likely += flux / sum * log((1 - e) * fmax(others, 0) + e / f->bins);
+    }
+    return likely;
+}
+
+#define GPHI_SIGMAS 8
+
+/* The likeliest sigma of the Gaussian: from the one chosen last up while that is likelier, else down. */
+static double gphi_choose_sigma(const gph_field *f, gphi_voxel *v, float *map, float *scratch)
+{
+    static const double sigmas[GPHI_SIGMAS] = {0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0};
+    double best, sum = 0, scale = f->desc.rows / 32.0;
+    int at = v->sigma ? (int)v->sigma - 1 : 3, from = at, step;
+    uint32_t i;
     for (i = 0; i < f->bins; ++i)
         sum += (double)map[i];
-    for (s = 0; s < 8; ++s) {
-        double likely = 0, wide = sigmas[s] * rows / 32, middle;
-        memcpy(map + f->bins, map, f->bins * sizeof *map);
-        middle = (double)gphi_blur(map + f->bins, scratch, rows, 2 * rows, wide);
-        for (i = 0; i < n; ++i) {
-            gphi_bin b = gphi_get_bin(v, f->bins, i);
-            double flux = (double)map[b.at], one = flux / ((double)*b.count_old + *b.count_now), others;
-            if (!(flux > 0))
-                continue;
-            others = ((double)map[f->bins + b.at] - middle * middle * one) / fmax(sum - one, 1e-9 * sum);
-            likely += flux / sum * log((1 - e) * fmax(others, 0) + e / f->bins);
-        }
-        if (likely > best) {
+    best = gphi_likelihood(f, v, map, scratch, sum, sigmas[at] * scale);
+    for (step = 1; step >= -1 && at == from; step -= 2)
+        while (at + step >= 0 && at + step < GPHI_SIGMAS) {
+            double likely = gphi_likelihood(f, v, map, scratch, sum, sigmas[at + step] * scale);
+            if (!(likely > best))
+                break;
             best = likely;
-            sigma = wide;
+            at += step;
         }
-    }
-    return sigma;
+    v->sigma = (uint32_t)at + 1;
+    return sigmas[at] * scale;
 }
 
 /* Value of a coarse map [rows][columns] at the centre of bin (r, c) of the map twice as fine: linear interpolation. */
@@ -2338,8 +2403,9 @@ static void gphi_pyramid(float *a, float *lit, int rows, int columns, int levels
             }
 }
 
-/* What is learned of a voxel: its histogram after desc.repair. map and scratch have room for 2 * bins. */
-static void gphi_repair_map(const gph_field *f, const gphi_voxel *v, float *map, float *scratch)
+/* What is learned of a voxel: its histogram after desc.repair; its sigma is noted. map and scratch have room for 2 *
+ * bins. */
+static void gphi_repair_map(const gph_field *f, gphi_voxel *v, float *map, float *scratch)
 {
     int rows = (int)f->desc.rows, columns = 2 * rows;
     uint32_t i, n = gphi_bins(v, f->bins);
@@ -2417,6 +2483,7 @@ static bool gphi_write_map(unsigned char *to, const float *map, uint32_t rows)
     scale = 32768 / most;
     for (i = 0; i < bins; ++i)
         weights[i] = map[i] > 0 ? gphi_half((float)fmin((double)map[i] * scale, 32768)) : 0;
+    memset(to + (rows + 1) * 8, 0, 56); /* between the sums of rows and of eights */
     gphi_sum_weights(to, rows, false);
     return true;
 }
@@ -2435,13 +2502,13 @@ static void gphi_block_layout(gphi_block *b)
 {
     uint64_t at = (sizeof *b + 63) & ~(uint64_t)63;
     b->keys_at = at;
-    at = (at + b->slots * sizeof(uint64_t) + 63) & ~(uint64_t)63;
+    at = (at + (uint64_t)b->slots * sizeof(uint64_t) + 63) & ~(uint64_t)63;
     b->roots_at = at;
-    at = (at + b->slots * sizeof(uint32_t) + 63) & ~(uint64_t)63;
+    at = (at + (uint64_t)b->slots * sizeof(uint32_t) + 63) & ~(uint64_t)63;
     b->nodes_at = at;
-    at = (at + b->nodes * sizeof(gph_node) + 63) & ~(uint64_t)63;
+    at = (at + (uint64_t)b->nodes * sizeof(gph_node) + 63) & ~(uint64_t)63;
     b->voxels_at = at;
-    at = (at + b->voxels * sizeof(gph_voxel) + 63) & ~(uint64_t)63;
+    at = (at + (uint64_t)b->voxels * sizeof(gph_voxel) + 63) & ~(uint64_t)63;
     b->maps_at = at;
     b->size = at + (uint64_t)b->maps * b->map_bytes;
 }
@@ -2473,7 +2540,15 @@ typedef struct gphi_publish {
     gphi_block *block;
 } gphi_publish;
 
-/* Maps of new photons are made anew, others kept. */
+/* Whether a map is to be made anew: at the third of the photons that is new, what they add is more than noise. A closed
+   voxel's is not used before it is tried again. */
+static bool gphi_stale(const gphi_state *s)
+{
+    return s->map == GPH_NONE ||
+           (s->changed & 1 && s->verdict != GPH_GATE_CLOSED && 3.0 * (double)s->fresh >= s->photons);
+}
+
+/* Stale maps are made anew, others kept. */
 static void gphi_publish_maps(void *context, uint32_t begin, uint32_t end)
 {
     const gphi_publish *p = (const gphi_publish *)context;
@@ -2481,7 +2556,7 @@ static void gphi_publish_maps(void *context, uint32_t begin, uint32_t end)
     float map[2 * GPHI_MAX_BINS], scratch[2 * GPHI_MAX_BINS];
     uint32_t i;
     for (i = begin; i < end; ++i) {
-        const gphi_voxel *v = &f->voxels[i];
+        gphi_voxel *v = &f->voxels[i];
         gph_voxel *out = &gphi_block_voxels(p->block)[i];
         out->alpha = 1;
         out->photons = (float)v->s.photons;
@@ -2489,23 +2564,23 @@ static void gphi_publish_maps(void *context, uint32_t begin, uint32_t end)
         out->gate = (uint16_t)v->s.verdict;
         if (out->map == GPH_NONE)
             continue;
-        if (!(v->s.changed & 1) && v->s.map != GPH_NONE)
+        if (!gphi_stale(&v->s))
             memcpy(gphi_block_map(p->block, out->map), gphi_block_map(f->block, v->s.map), f->map_bytes);
         else {
             gphi_repair_map(f, v, map, scratch);
-            gphi_write_map(gphi_block_map(p->block, out->map), map, f->desc.rows); /* lit: photons have flux > 0 */
+            gphi_write_map(gphi_block_map(p->block, out->map), map, f->desc.rows); /* it is lit */
         }
         out->alpha = v->s.verdict == GPH_GATE_CLOSED ? 1.0f : v->s.alpha;
     }
 }
 
-/* A voxel has a map where its histogram has light: halving may have left none. */
+/* A voxel has a map where its histogram has light: halving may have left next to none. */
 static bool gphi_lit(const gphi_voxel *v, uint32_t bins)
 {
     uint32_t i, n = gphi_bins(v, bins);
     for (i = 0; i < n; ++i) {
         gphi_bin b = gphi_get_bin(v, bins, i);
-        if (*b.old + *b.now > 0)
+        if (*b.old + *b.now > GPHI_MIN_LIT)
             return true;
     }
     return false;
@@ -2526,8 +2601,26 @@ static void gphi_publish_cubes(const gph_field *f, gphi_block *b)
     }
 }
 
-/* Header and memory of a sampling part; NULL = out of memory. */
-static gphi_block *gphi_block_make(const gph_field *f, uint32_t maps)
+/* See that the spare block has room for `size` bytes, and not for many more. After the first refine a new one has a
+   quarter more where max_bytes allows: fresh memory is slow, zeroed by the system page by page. */
+static bool gphi_spare_room(gph_field *f, uint64_t size)
+{
+    uint64_t bytes = f->stats.passes ? size + size / 4 : size;
+    if (f->spare && size <= f->spare_bytes && f->spare_bytes / 2 <= bytes)
+        return true;
+    gphi_drop_spare(f);
+    if (gphi_held(f) - f->block_bytes + (bytes > f->block_bytes ? bytes : f->block_bytes) + bytes > f->desc.max_bytes)
+        bytes = size; /* the next one is to find room too */
+    if (bytes > (uint64_t)((size_t)-1 / 2))
+        return false;
+    f->spare = (gphi_block *)f->desc.allocate(f->desc.user, (size_t)bytes);
+    f->spare_bytes = f->spare ? bytes : 0;
+    return f->spare != NULL;
+}
+
+/* Make the spare block a sampling part, with its header and cubes; voxels and maps are to be written. False = out of
+   memory. */
+static bool gphi_block_make(gph_field *f, uint32_t maps)
 {
     gphi_block shape, *b;
     memset(&shape, 0, sizeof shape);
@@ -2542,14 +2635,28 @@ static gphi_block *gphi_block_make(const gph_field *f, uint32_t maps)
     memcpy(shape.origin, f->origin, sizeof shape.origin);
     shape.side = f->side;
     gphi_block_layout(&shape);
-    b = (gphi_block *)gphi_allocate(&f->desc, shape.size, 1);
-    if (!b)
-        return NULL;
+    if (!gphi_spare_room(f, shape.size))
+        return false;
+    b = f->spare;
+    memset(b, 0, (size_t)shape.maps_at); /* gaps and free slots, so that saves are alike; maps are written in full */
     *b = shape;
     if (f->node_count)
         memcpy(gphi_part(b, b->nodes_at), f->nodes, f->node_count * sizeof *f->nodes);
     gphi_publish_cubes(f, b);
-    return b;
+    return true;
+}
+
+/* The spare block becomes the sampling part, and the other way round. */
+static void gphi_swap_blocks(gph_field *f)
+{
+    gphi_block *old = f->block;
+    uint64_t bytes = f->block_bytes;
+    f->block = f->spare;
+    f->block_bytes = f->spare_bytes;
+    f->spare = old;
+    f->spare_bytes = bytes;
+    if (bytes / 2 > f->block->size + f->block->size / 4)
+        gphi_drop_spare(f);
 }
 
 /* Make what building knows the sampling part. */
@@ -2560,24 +2667,23 @@ static gph_result gphi_publish_all(gph_field *f, gph_parallel_fn parallel, void 
     for (i = 0; i < f->voxel_count; ++i)
         maps += gphi_lit(&f->voxels[i], f->bins);
     p.field = f;
-    p.block = gphi_block_make(f, maps);
-    if (!p.block)
+    if (!gphi_block_make(f, maps))
         return GPH_OUT_OF_MEMORY;
+    p.block = f->spare;
     for (maps = i = 0; i < f->voxel_count; ++i)
         gphi_block_voxels(p.block)[i].map = gphi_lit(&f->voxels[i], f->bins) ? maps++ : GPH_NONE;
     gphi_run(parallel, user, f->voxel_count, 16, gphi_publish_maps, &p);
     for (i = 0; i < f->voxel_count; ++i) {
         gphi_state *s = &f->voxels[i].s;
-        uint32_t map = gphi_block_voxels(p.block)[i].map,
-                 made = map != GPH_NONE && (s->changed & 1 || s->map == GPH_NONE);
+        uint32_t map = gphi_block_voxels(p.block)[i].map, made = map != GPH_NONE && gphi_stale(s);
         f->stats.built += made;
         f->stats.skipped += map != GPH_NONE && !made;
-        s->changed = made && s->touched ? 2 : 0;
+        s->changed = !made ? s->changed & 1 : s->touched ? 2 : 0;
+        s->fresh = made ? 0 : s->fresh;
         s->map = map;
-        s->touched = s->fresh = 0;
+        s->touched = 0;
     }
-    gphi_release(&f->desc, f->block);
-    f->block = p.block;
+    gphi_swap_blocks(f);
     return GPH_OK;
 }
 
@@ -2634,22 +2740,26 @@ static void gphi_count(gph_field *f)
 GPH_API gph_result gph_refine(gph_field *field, gph_parallel_fn parallel, void *user)
 {
     gph_result result = GPH_OK;
-    bool first = !field->cloud_closed;
-    if (first && field->cloud_count) {
+    bool first = !field->cloud_closed || !field->first_photons; /* its cloud may have been cut in mid-pass */
+    if (!field->cloud_closed && field->cloud_count) {
         gphi_batch b;
         if (!gphi_batch_make(&b, field))
             return GPH_OUT_OF_MEMORY;
         result = gphi_close_cloud(&b, parallel, user);
-        gphi_release(&field->desc, b.hits);
+        gphi_batch_free(&b);
     }
     if (!field->first_photons)
         field->first_photons = field->stats.photons;
-    gphi_judge_all(field);
-    if (!first && gphi_split_all(field))
-        result = GPH_OUT_OF_MEMORY;
-    gphi_recycle(field);
+    if (!field->judged) {
+        gphi_judge_all(field);
+        if (!first && gphi_split_all(field))
+            result = GPH_OUT_OF_MEMORY;
+        gphi_recycle(field);
+        field->judged = 1; /* what follows may fail: then the next call only publishes */
+    }
     if (gphi_publish_all(field, parallel, user))
         return GPH_OUT_OF_MEMORY;
+    field->judged = 0;
     field->stats.passes++;
     gphi_count(field);
     return result;
@@ -2775,11 +2885,11 @@ GPH_API gph_result gph_create(const gph_desc *desc, gph_field **field)
     gphi_field_options(f);
     if (gphi_has_bounds(&d))
         gphi_set_box(f, d.bounds_min, d.bounds_max);
-    f->block = gphi_block_make(f, 0);
-    if (!f->block) {
+    if (!gphi_block_make(f, 0)) {
         gphi_release(&d, f);
         return GPH_OUT_OF_MEMORY;
     }
+    gphi_swap_blocks(f);
     gphi_count(f);
     *field = f;
     return GPH_OK;
@@ -2800,6 +2910,7 @@ GPH_API void gph_destroy(gph_field *field)
     gphi_release(&d, field->voxels);
     gphi_release(&d, field->cloud);
     gphi_release(&d, field->block);
+    gphi_release(&d, field->spare);
     gphi_release(&d, field);
 }
 
@@ -2979,7 +3090,7 @@ typedef struct gphi_header {
     gph_stats stats;
     double origin[3], side;
     uint64_t first_photons, pass_photons, pass_useful, block_size;
-    uint32_t cubes, nodes, voxels, cloud, cloud_closed, reserved;
+    uint32_t cubes, nodes, voxels, cloud, cloud_closed, judged;
 } gphi_header;
 
 static const char gphi_magic[8] = {'g', 'u', 'i', 'd', 'e', 'p', 'h', 'o'};
@@ -3065,6 +3176,7 @@ GPH_API gph_result gph_save(const gph_field *field, void *data, size_t capacity,
     h.voxels = field->voxel_count;
     h.cloud = field->cloud_count;
     h.cloud_closed = field->cloud_closed;
+    h.judged = field->judged;
     gphi_write(&at, &h, sizeof h);
     gphi_write(&at, field->cubes, field->cube_count * sizeof *field->cubes);
     gphi_write(&at, field->nodes, field->node_count * sizeof *field->nodes);
@@ -3125,7 +3237,8 @@ static bool gphi_voxel_valid(const gph_field *f, const gphi_voxel *v)
     uint32_t i, n = gphi_bins(v, f->bins), last = 0;
     if (!gphi_sums_valid(&v->s.now) || !gphi_sums_valid(&v->s.held) || !(v->s.photons >= 0 && v->s.photons < 1e30) ||
         v->s.valid > 1 || v->s.rolled > f->stats.passes || (v->s.map != GPH_NONE && v->s.map >= f->block->maps) ||
-        v->s.changed > 3 || v->s.verdict > GPH_GATE_CLOSED || !gphi_within_float(v->s.alpha, 0.04f, 1))
+        v->s.changed > 3 || v->sigma > GPHI_SIGMAS || v->s.verdict > GPH_GATE_CLOSED ||
+        !gphi_within_float(v->s.alpha, 0.04f, 1))
         return false;
     for (i = 0; i < n; ++i) {
         gphi_bin b = gphi_get_bin(v, f->bins, i);
@@ -3140,8 +3253,9 @@ static bool gphi_voxel_valid(const gph_field *f, const gphi_voxel *v)
 /* Sizes of a histogram that must hold before it is looked into. */
 static bool gphi_form_valid(const gphi_state *s, uint32_t capacity)
 {
-    return s->form == GPHI_FORM_SPARSE ? capacity <= GPHI_SPARSE && s->entries <= capacity
-                                       : s->form <= GPHI_FORM_DENSE && capacity == 0 && s->entries == 0;
+    return s->form == GPHI_FORM_SPARSE
+               ? capacity >= 8 && capacity <= GPHI_SPARSE && (capacity & (capacity - 1)) == 0 && s->entries <= capacity
+               : s->form <= GPHI_FORM_DENSE && capacity == 0 && s->entries == 0;
 }
 
 static gph_result gphi_building_valid(const gph_field *f)
@@ -3301,6 +3415,7 @@ static gph_result gphi_load_parts(gph_field *f, const gphi_header *h, gphi_reade
     if (h->block_size < sizeof(gphi_block) || h->block_size != r->left)
         return GPH_BAD_FILE;
     f->block = (gphi_block *)gphi_read(r, d, h->block_size, 1);
+    f->block_bytes = f->block ? h->block_size : 0;
     if (!f->block || !gphi_hash_cubes(f, h->cubes))
         return GPH_OUT_OF_MEMORY;
     return gphi_block_shape_valid(f->block, h->block_size, f) ? gph_validate(f) : GPH_BAD_FILE;
@@ -3311,8 +3426,8 @@ static bool gphi_header_valid(const gphi_header *h, const gph_desc *d)
 {
     int k;
     bool ok = h->voxels <= GPHI_MAX_VOXELS && h->nodes <= 2 * h->voxels && h->cubes <= h->voxels &&
-              h->cloud <= d->cloud_photons && h->cloud_closed <= 1 && h->stats.passes < 1u << 30 && h->side >= 0 &&
-              h->side < 1e31 && (h->side > 0 || h->voxels == 0);
+              h->cloud <= d->cloud_photons && h->cloud_closed <= 1 && h->judged <= 1 && h->stats.passes < 1u << 30 &&
+              h->side >= 0 && h->side < 1e31 && (h->side > 0 || h->voxels == 0);
     for (k = 0; k < 3; ++k)
         ok = ok && fabs(h->origin[k]) < 1e31;
     return ok && gphi_within_float(h->stats.closed_share, 0, 1) && gphi_within_float(h->stats.mean_alpha, 0, 1) &&
@@ -3360,6 +3475,7 @@ GPH_API gph_result gph_load(const gph_desc *desc, const void *data, size_t size,
     f->pass_photons = h.pass_photons;
     f->pass_useful = h.pass_useful;
     f->cloud_closed = h.cloud_closed;
+    f->judged = h.judged;
     gphi_field_options(f);
     r.at = (const char *)data + sizeof h;
     r.left = size - sizeof h;
@@ -3394,15 +3510,17 @@ static gph_result gphi_merge_voxel(gph_field *f, uint32_t to, const gph_field *g
     double *sum = (double *)(void *)&v->s.now;
     const double *more = (const double *)(const void *)&source->s.now;
     uint32_t i, n = gphi_bins(source, g->bins), lit = 0;
+    if (source->s.rolled != g->stats.passes)
+        n = 0; /* no photons in this pass */
     for (i = 0; i < sizeof(gphi_sums) / sizeof(double); ++i)
         sum[i] += more[i];
     v->s.touched += source->s.touched;
     v->s.valid |= source->s.valid;
     f->stats.vertices += source->s.touched;
-    if (source->s.rolled != g->stats.passes || !source->s.fresh)
-        return GPH_OK;
     for (i = 0; i < n; ++i)
         lit += *gphi_get_bin(source, g->bins, i).count_now > 0;
+    if (!lit)
+        return GPH_OK;
     if (gphi_make_room(f, to, lit) || v->s.blocked)
         return GPH_OUT_OF_MEMORY;
     gphi_roll(v, f->bins, f->stats.passes);
@@ -3410,9 +3528,9 @@ static gph_result gphi_merge_voxel(gph_field *f, uint32_t to, const gph_field *g
         gphi_bin b = gphi_get_bin(source, g->bins, i);
         if (*b.count_now)
             gphi_add(v, f->bins, b.at, *b.now, *b.count_now);
+        f->stats.photons += *b.count_now;
     }
     v->s.changed |= 1;
-    f->stats.photons += source->s.fresh;
     return GPH_OK;
 }
 
@@ -3442,12 +3560,13 @@ static gph_result gphi_merge_cloud(gph_field *f, const gph_field *g, gph_paralle
         for (k = 0; k < b.count; ++k) {
             b.hits[k] = g->cloud[i + k].hit;
             b.hits[k].voxel = gphi_find(f, g->cloud[i + k].position);
+            b.samples[k] = g->cloud[i + k].position;
             f->stats.photons += b.hits[k].voxel < f->voxel_count;
         }
-        if (gphi_settle(&b, g->cloud[i].position, sizeof *g->cloud, parallel, user))
+        if (gphi_settle(&b, parallel, user))
             result = GPH_OUT_OF_MEMORY;
     }
-    gphi_release(&f->desc, b.hits);
+    gphi_batch_free(&b);
     return result;
 }
 

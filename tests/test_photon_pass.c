@@ -1162,6 +1162,9 @@ typedef struct shooter {
     double flux[SHOOTER_TILES];
     uint64_t photons[SHOOTER_TILES];
     int tiles, asked, flushed, fail;
+    bool seen[SHOOTER_TILES]; /* camera tiles with records that were not taken in yet */
+    int taken;                /* those taken in since it was asked */
+    bool pending;             /* photons were not taken in yet */
 } shooter;
 static shooter the_shooter;
 
@@ -1169,6 +1172,7 @@ static void *shooter_create(tr_method_env *env, char *err, size_t err_size)
 {
     (void)err, (void)err_size;
     assert_in_range(env->photon_tiles, 1, SHOOTER_TILES);
+    assert_in_range(env->tiles, 1, SHOOTER_TILES);
     the_shooter.tiles = env->photon_tiles;
     return &the_shooter;
 }
@@ -1177,6 +1181,10 @@ static uint64_t shooter_wants(void *method, const tr_pass *pass)
 {
     shooter *m = method;
     assert_int_equal(pass->index, m->asked);
+    assert_false(pass->last);
+    assert_true(m->taken > 0); /* the pass's camera paths were before */
+    m->taken = 0;
+    m->pending = pass->index == 1;
     m->asked++;
     return pass->index == 1 ? SHOOTER_PATHS : 0;
 }
@@ -1190,13 +1198,37 @@ static bool shooter_record(void *method, int tile, const tr_photon *photons, int
     m->photons[tile] += (uint64_t)n;
     return true;
 }
-static void shooter_flush(void *method) { ((shooter *)method)->flushed++; }
+static bool shooter_record_camera(void *method, int tile, const tr_vertex *vertices, int n)
+{
+    (void)vertices;
+    ((shooter *)method)->seen[tile] = n > 0;
+    return true;
+}
+static void shooter_flush(void *method)
+{
+    shooter *m = method;
+    int before = m->taken;
+    for (int i = 0; i < SHOOTER_TILES; ++i)
+        m->taken += m->seen[i];
+    memset(m->seen, 0, sizeof m->seen);
+    if (m->taken == before) { /* photons */
+        m->flushed++;
+        m->pending = false;
+    }
+}
+static bool shooter_end(void *method, const tr_pass *pass)
+{
+    assert_false(pass->last || ((shooter *)method)->pending);
+    return true;
+}
 static const tr_method shooter_table = {.name = "shooter",
                                         .create = shooter_create,
                                         .destroy = shooter_destroy,
+                                        .record = shooter_record_camera,
                                         .wants_photons = shooter_wants,
                                         .record_photons = shooter_record,
-                                        .flush = shooter_flush};
+                                        .flush = shooter_flush,
+                                        .end_pass = shooter_end};
 
 static void passes_hand_photons_to_the_method(void **state)
 {
@@ -1216,8 +1248,8 @@ static void passes_hand_photons_to_the_method(void **state)
     settings.method = &shooter_table;
     memset(&the_shooter, 0, sizeof the_shooter);
     assert_true(tr_render(s, &settings, &result, err, sizeof err));
-    assert_int_equal(the_shooter.asked, result.passes);
-    assert_int_equal(the_shooter.flushed, 2); /* two rounds of photons; this method has no other records */
+    assert_int_equal(the_shooter.asked, result.passes - 1); /* the last pass teaches nothing */
+    assert_int_equal(the_shooter.flushed, 2);               /* two rounds of photons */
     assert_int_equal(result.photon_paths, SHOOTER_PATHS);
     assert_true(result.photon_seconds > 0 && result.photon_seconds < result.cpu_seconds);
     double flux = 0;

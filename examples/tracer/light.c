@@ -296,7 +296,7 @@ bool tr_lights_finish(tr_scene *scene, tr_log *log)
     scene->environment = malloc((n + 1) * sizeof(int));
     scene->light_cdf = malloc(2 * (n + 1) * sizeof(float));
     scene->power_cdf = scene->light_cdf ? scene->light_cdf + n + 1 : NULL;
-    double *power = malloc(2 * (n + 1) * sizeof(double)), *photon_power = power + n + 1;
+    double *power = malloc(2 * (n + 1) * sizeof(double)), *photon_power = power ? power + n + 1 : NULL;
     bool ok = scene->environment && scene->light_cdf && power;
     for (size_t i = 0; ok && i < n; ++i) {
         tr_light *light = &scene->lights[i];

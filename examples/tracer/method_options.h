@@ -60,6 +60,16 @@ static double number(parser *p, const char *key, double fallback)
     return x;
 }
 
+/* A whole number that fits. */
+static inline uint32_t whole(parser *p, const char *key, uint32_t fallback)
+{
+    double x = number(p, key, fallback);
+    if (x >= 0 && x <= 4294967295.0 && x == floor(x))
+        return (uint32_t)x;
+    complain(p, key, option(p->env, key), "a whole number, 0 .. 4294967295");
+    return fallback;
+}
+
 /* Whether a tile's paths are worth recording: every 1 / fraction-th, starting elsewhere in every pass. */
 static inline bool tile_records(int pass, float fraction, int tile)
 {

@@ -6,8 +6,8 @@
    learn_alpha=ratio|variance|off (on = variance), alpha, gate=on|off, gate_margin, gate_probe, uniform, surface=on|off
    (what lies below the surface is mirrored up), jitter=on|off (find looks up a jittered position).
 
-   A pass's photons are traced before its camera paths, so the first pass has none: no voxel is valid yet. While no
-   voxel guides, only every fourth pass has some. */
+   A pass's photons are traced after its camera paths, which make voxels valid, also those that the refine before has
+   cut. While no voxel guides, only every fourth pass has some. */
 #include "method_options.h"
 
 #define GPH_IMPLEMENTATION
@@ -38,20 +38,20 @@ static bool parse(parser *p, gph_desc *d, photon *m)
         complain(p, "photons", option(p->env, "photons"), "0 .. 16");
     d->repair = (gph_repair)(choice(p, "repair", "none|gaussian|pyramid|pull_push") + 1);
     d->sigma = (float)number(p, "sigma", 0);
-    d->pyramid_levels = (uint32_t)number(p, "pyramid_levels", 0);
-    d->rows = (uint32_t)number(p, "rows", 0);
-    d->grid_cells = (uint32_t)number(p, "grid", 0);
+    d->pyramid_levels = whole(p, "pyramid_levels", 0);
+    d->rows = whole(p, "rows", 0);
+    d->grid_cells = whole(p, "grid", 0);
     d->split_photons = (float)number(p, "c", 0);
-    d->max_levels = (uint32_t)number(p, "max_levels", 0);
-    d->keep_passes = (uint32_t)number(p, "keep_passes", 0);
-    d->max_bytes = (uint64_t)(number(p, "max_memory_mb", 0) * 1048576.0);
+    d->max_levels = whole(p, "max_levels", 0);
+    d->keep_passes = whole(p, "keep_passes", 0);
+    d->max_bytes = (uint64_t)whole(p, "max_memory_mb", 0) << 20;
     learn = choice(p, "learn_alpha", "off|ratio|variance|on");
     d->alpha_mode = (gph_alpha_mode)(learn == 3 ? GPH_ALPHA_VARIANCE : learn + 1);
     d->alpha = (float)number(p, "alpha", 0);
     d->uniform = (float)number(p, "uniform", 0);
     d->no_gate = choice(p, "gate", "off|on") == 0;
     d->gate_margin = (float)number(p, "gate_margin", 0);
-    d->gate_probe = (uint32_t)number(p, "gate_probe", 0);
+    d->gate_probe = whole(p, "gate_probe", 0);
     m->surface = choice(p, "surface", "off|on") != 0;
     m->jitter = choice(p, "jitter", "off|on") == 1;
     return p->ok;
@@ -119,7 +119,7 @@ static uint64_t photon_wants_photons(void *method, const tr_pass *pass)
     photon *m = method;
     gph_stats s;
     gph_get_stats(m->field, &s);
-    if (pass->last || s.valid == 0 || (s.maps > 0 && gph_all_closed(m->field) && pass->index % IDLE_PASSES != 0))
+    if (pass->last || (s.maps > 0 && gph_all_closed(m->field) && pass->index % IDLE_PASSES != 0))
         return 0;
     m->flux = floor(m->per_path * m->paths * pass->spp + 0.5);
     return (uint64_t)m->flux;

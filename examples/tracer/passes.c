@@ -14,9 +14,8 @@
 
 #define MAX_GROUPS 32
 #define GROWTH 4 /* a learning pass is 1 / GROWTH of all before it */
-#define ROUND_PATHS                                                                                                    \
-    (1 << 17) /* camera paths between two flushes: bounds the memory of records; each may be split; the                \
-                 same of photon paths */
+/* Camera paths between two flushes, and photon paths: bounds the memory of records. Each may be split. */
+#define ROUND_PATHS (1 << 17)
 
 /* Passes that were sampled in the same way, or nearly so: plain sums are the best way to join them. */
 typedef struct group {
@@ -92,7 +91,8 @@ static void render_samples(render_state *r, uint64_t first_sample, int samples)
     }
 }
 
-/* The photons that the method wants, before the camera paths of a pass. False = out of memory. */
+/* The photons that the method wants, after the camera paths of a pass, which have told where light is looked for. False
+   = out of memory. */
 static bool shoot_photons(render_state *r, const tr_pass *info)
 {
     const tr_method *m = r->settings->method;
@@ -493,14 +493,12 @@ static bool next_pass(render_state *r, int limit)
     r->frame.record = m->begin_pass ? m->begin_pass(r->frame.method_data, &info) : m->record != NULL;
     r->frame.guiding = m->find && !(m->idle && m->idle(r->frame.method_data));
     r->frame.estimate = m->wants_pixel_estimate && pass > 0 ? &r->estimate : NULL;
-    if (!shoot_photons(r, &info))
-        return false;
     info.spp = run_pass(r, pass, info.spp);
     r->cost = (cpu_used(r) - cpu) / info.spp;
     r->guided = total_guided(r) > guided_before;
     bool ok = close_pass(r, r->done - info.spp, info.spp, r->guided);
     if (ok && !info.last && !r->out_of_time)
-        ok = learn(r, &info);
+        ok = shoot_photons(r, &info) && learn(r, &info);
     res->pass[pass].spp = info.spp;
     res->pass[pass].cpu_seconds = cpu_used(r) - cpu;
     res->pass[pass].variance = r->groups[r->group_count - 1].variance;

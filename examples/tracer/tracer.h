@@ -295,8 +295,7 @@ typedef struct tr_scene {
     int *environment; /* ids of envmap, constant and sun lights */
     int environment_count;
     float *light_cdf; /* [light_count + 1] */
-    float
-        *power_cdf; /* [light_count + 1], by power alone: which light a photon comes from; within light_cdf's memory */
+    float *power_cdf; /* [light_count + 1], by power alone, for photons; within light_cdf's memory */
     uint64_t triangles;
     RTCDevice device;
     RTCScene rtc;
@@ -424,8 +423,8 @@ typedef struct tr_emission {
 } tr_emission;
 
 /* Draw a ray that leaves a light: the light by power, a point on it by area, a direction by cosine or by the
-   environment map; those without a place shine on the disk that the scene's bounding sphere shows them. u in [0,1)^5:
-   light, place, direction. False = none (no light has power, or a spot's rim). */
+   environment map; those without a place shine through the shadow of the scene's bounding box. u in [0,1)^5: light,
+   place, direction. False = none (no light has power, or a spot's rim). */
 bool tr_light_emit(const tr_scene *scene, const float u[5], tr_emission *emission);
 
 /* ---- >>vertex ----------------------------------------------------------------------------------------------- */
@@ -473,9 +472,9 @@ typedef struct tr_photon {
     uint32_t flags; /* TR_PHOTON_..., 0 = what a guided direction from p can find */
 } tr_photon;
 #define TR_PHOTON_DIRECT 1u /* straight from a light, which next event estimation samples */
-#define TR_PHOTON_UNSEEN                                                                                               \
-    2u /* light that no camera path gathers: a point's, spot's or directional light's through glass                    \
-          or mirrors, or any of theirs without next event estimation */
+/* Light that no camera path gathers: a point's, spot's or directional light's through glass or mirrors, or any of
+   theirs without next event estimation. */
+#define TR_PHOTON_UNSEEN 2u
 
 /* Photon paths first .. first + count - 1 of pass `index`, whose paths are `total`. */
 typedef struct tr_photon_pass {
@@ -583,7 +582,8 @@ typedef struct tr_method {
     void (*describe)(void *method, int n, const void *handles, float *cell, float *depth); /* for the picture layers */
     void (*set_pixel_estimate)(void *method, const tr_image *estimate);
     bool wants_pixel_estimate;
-    /* Photon paths to trace before this pass's camera paths, after begin_pass; 0 = none. */
+    /* Photon paths to trace after this pass's camera paths have been taken in, before end_pass; 0 = none. Asked only
+       where end_pass follows. */
     uint64_t (*wants_photons)(void *method, const tr_pass *pass);
     /* A tr_photon_fn: streams like record's, taken in by flush. */
     bool (*record_photons)(void *method, int tile, const tr_photon *photons, int n);
