@@ -287,17 +287,19 @@ static double mean_alpha(const tr_result *r)
     return sum / (80 * 48);
 }
 
-static void trained_agrees(const char *scene_name, const char *define, const char *value, int spp, bool nee, int train)
+static void method_agrees(const char *method, const char *scene_name, const char *define, const char *value, int spp,
+                          bool nee, int train)
 {
     tr_scene *scene = load(scene_name, define, value);
     tr_settings s = small("pt", SPP(spp));
     s.no_nee = !nee;
     tr_result pt = render(scene, &s);
-    s.method = tr_method_find("sdtree");
+    s.method = tr_method_find(method);
     s.seed = 1;
     s.train = train;
     tr_result guided = render(scene, &s);
-    assert_agree("pt and sdtree", &pt, &guided);
+    print_message("%s: mean selection probability %.2f\n", method, mean_alpha(&guided));
+    assert_agree("pt and the method", &pt, &guided);
     assert_true(mean_alpha(&guided) < 0.9); /* it did guide: without, there would be nothing to compare */
     tr_result_free(&pt);
     tr_result_free(&guided);
@@ -306,7 +308,7 @@ static void trained_agrees(const char *scene_name, const char *define, const cha
 
 static void guided_agrees(const char *scene_name, const char *define, const char *value, int spp, bool nee)
 {
-    trained_agrees(scene_name, define, value, spp, nee, 0);
+    method_agrees("sdtree", scene_name, define, value, spp, nee, 0);
 }
 
 /* Lamps are so large that unguided paths find them often: z means little where one path in a million brings the light,
@@ -314,12 +316,25 @@ static void guided_agrees(const char *scene_name, const char *define, const char
 static void guided_agrees_on_cornell(void **state) { (void)state, guided_agrees("cornell", NULL, NULL, 127, false); }
 static void guided_agrees_on_gloss(void **state) { (void)state, guided_agrees("gloss", "bulb", "0.3", 127, true); }
 static void guided_agrees_on_ajar(void **state) { (void)state, guided_agrees("ajar", "gap", "120", 127, true); }
-static void trained_agrees_on_ajar(void **state) { (void)state, trained_agrees("ajar", "gap", "120", 127, true, 16); }
+static void trained_agrees_on_ajar(void **state)
+{
+    (void)state, method_agrees("sdtree", "ajar", "gap", "120", 127, true, 16);
+}
 static void guided_agrees_on_torus(void **state) { (void)state, guided_agrees("torus", "light_size", "1", 127, true); }
 static void guided_agrees_on_egg(void **state) { (void)state, guided_agrees("egg", "bulb", "0.3", 100, true); }
 static void guided_agrees_on_lamps(void **state) { (void)state, guided_agrees("lamps", "bulb", "0.12", 100, true); }
 static void guided_agrees_on_pool(void **state) { (void)state, guided_agrees("pool", "sun_size", "40", 100, true); }
 static void guided_agrees_on_maze(void **state) { (void)state, guided_agrees("maze", "lamp_z", "-2.3", 100, true); }
+static void kd_agrees_on_ajar(void **state) { (void)state, method_agrees("kd", "ajar", "gap", "120", 127, true, 0); }
+static void kd_agrees_on_egg(void **state) { (void)state, method_agrees("kd", "egg", "bulb", "0.3", 100, true, 0); }
+static void photons_agree_on_ajar(void **state)
+{
+    (void)state, method_agrees("photon", "ajar", "gap", "120", 127, true, 0);
+}
+static void photons_agree_on_egg(void **state)
+{
+    (void)state, method_agrees("photon", "egg", "bulb", "0.3", 100, false, 0);
+}
 
 /* ---- >>splitting -------------------------------------------------------------------------------------------- */
 
@@ -440,7 +455,7 @@ static void same_for_threads(const char *method, int train)
     s.train = train;
     s.threads = 1;
     tr_result one = render(scene, &s);
-    assert_true(!strcmp(method, "pt") || one.split_paths > 0);
+    assert_true(strcmp(method, "sdtree") != 0 || one.split_paths > 0);
     for (int threads = 2; threads <= 5; threads += 3) {
         s.threads = threads;
         tr_result many = render(scene, &s);
@@ -459,6 +474,7 @@ static void same_for_threads(const char *method, int train)
 
 static void pt_is_identical_for_any_threads(void **state) { (void)state, same_for_threads("pt", 0); }
 static void sdtree_is_identical_for_any_threads(void **state) { (void)state, same_for_threads("sdtree", 0); }
+static void photons_are_identical_for_any_threads(void **state) { (void)state, same_for_threads("photon", 0); }
 static void trained_is_identical_for_any_threads(void **state) { (void)state, same_for_threads("sdtree", 9); }
 
 /* With every gate closed the guided render is the unguided one. */
@@ -554,10 +570,15 @@ int main(void)
         cmocka_unit_test(guided_agrees_on_lamps),
         cmocka_unit_test(guided_agrees_on_pool),
         cmocka_unit_test(guided_agrees_on_maze),
+        cmocka_unit_test(kd_agrees_on_ajar),
+        cmocka_unit_test(kd_agrees_on_egg),
+        cmocka_unit_test(photons_agree_on_ajar),
+        cmocka_unit_test(photons_agree_on_egg),
         cmocka_unit_test(splitting_changes_no_mean),
         cmocka_unit_test(trained_agrees_on_ajar),
         cmocka_unit_test(pt_is_identical_for_any_threads),
         cmocka_unit_test(sdtree_is_identical_for_any_threads),
+        cmocka_unit_test(photons_are_identical_for_any_threads),
         cmocka_unit_test(trained_is_identical_for_any_threads),
         cmocka_unit_test(training_is_not_in_the_picture),
         cmocka_unit_test(closed_gate_changes_no_bit),
