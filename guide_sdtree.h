@@ -62,8 +62,9 @@
      quadtree: bright light, for which it matters, decides. A quadtree of few far lights so stays sharp in a large cell
      [in place of the distance of every lobe, Ruppert 2020]. The pivot is the middle of the cell; parts of it keep it
      while all of them lie within 0.6 radii of it and nearness has not changed by a factor of two, since sums are seen
-     from there. The even share is even as seen from the place. Places beyond 0.8 radii, which only jitter and positions
-     outside the bounds lead to, are taken for those at 0.8. Distances of INFINITY: no parallax; forests have none.
+     from there. The first pass chooses none: what it met by chance from all over the scene would stay with its parts.
+     The even share is even as seen from the place. Places beyond 0.8 radii, which only jitter and positions outside the
+     bounds lead to, are taken for those at 0.8. Distances of INFINITY: no parallax; forests have none.
 
      What is learned (desc.target); p = pdf_mix, the density the direction was drawn with:
        radiance        mass of a leaf = sum of L / p                                              [Mueller 2017]
@@ -4156,7 +4157,7 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
                                  r->child + p->first, r->sum + p->first);
             s->held = old->held * keep;
             s->lit = old->lit * keep;
-            if (!r->desc->forest_cells)
+            if (!r->desc->forest_cells && r->field->passes > 0)
                 gsdi_choose_pivot(r->block, s); /* before its mass fades, perhaps to nothing */
             s->mass *= r->keep;
             s->near_mass *= r->keep;
