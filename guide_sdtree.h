@@ -156,10 +156,10 @@
      filled with a hash of u, so that small leaves are covered densely. A float direction can land in a neighbour leaf
      after rounding (depth 20: 2 %, depth 12: 0.006 %): gsd_sample returns the density of the rounded direction, the
      same as gsd_pdf for it, but for some 4e-6 of directions near the poles of trees of depth 20 with parallax. phi is
-   computed to 4e-8 rad. SIMD levels differ from scalar by <= 2e-6 relative (4e-6 with parallax), and by the neighbour's
-   density for about 1e-6 of directions within rounding of a leaf's edge. accumulate and refine use one code path for
-   all levels, but for the matrices of GSD_DENOISE_GAUSSIAN: they differ by <= 1e-6 relative, so that a node within that
-   of the threshold is divided at one level and not at another.
+     computed to 4e-8 rad. SIMD levels differ from scalar by <= 2e-6 relative (4e-6 with parallax), and by the
+     neighbour's density for about 1e-6 of directions within rounding of a leaf's edge. accumulate and refine use one
+     code path for all levels, but for the matrices of GSD_DENOISE_GAUSSIAN: they differ by <= 1e-6 relative, so that
+     a node within that of the threshold is divided at one level and not at another.
 
    REFERENCES
      T. Mueller, M. Gross, J. Novak 2017, Practical Path Guiding for Efficient Light-Transport Simulation.
@@ -614,7 +614,7 @@ GSD_QUERY uint32_t gsd_leaf_at(const gsd_view *view, const gsd_handle *handle, u
     return node;
 }
 
-/* The cell as a handle, seen from its pivot (from elsewhere: gsd_offset, before gsd_orient). cell < view->cell_count;
+/* The cell as a handle, seen from its pivot (from elsewhere: gsd_see_from). cell < view->cell_count;
    larger ones give the uniform density. For forests. [any thread] */
 GSD_QUERY gsd_handle gsd_find_cell(const gsd_view *view, uint32_t cell)
 {
@@ -744,6 +744,13 @@ GSD_QUERY void gsd_orient(const gsd_view *view, gsd_handle *handle, const float 
     handle->product = 1 / (((z[0] + z[1]) + (z[2] + z[3])) + ((z[4] + z[5]) + (z[6] + z[7])));
 }
 
+/* See a handle from a position, before gsd_orient: gsd_find does it itself, this is for gsd_find_cell. [any thread] */
+GSD_QUERY void gsd_see_from(const gsd_view *view, gsd_handle *handle, const float position[3])
+{
+    const gsd_cell *c = &view->cells[handle->cell];
+    gsd_offset(c->pivot, c->nearness, position, handle->offset);
+}
+
 /* Find the cell of a position. normal (unit, on the side that light comes from) makes the density follow the cosine
    there; NULL or zero = no surface, or one that light passes. u = three random numbers in [0,1) jitter the position by
    the size of its cell, which blends neighbours (unbiased: sample and pdf speak of the handle's cell); NULL = the cell
@@ -764,7 +771,7 @@ GSD_QUERY gsd_handle gsd_find(const gsd_view *view, const float position[3], con
         cell = gsd_cell_at(view, g);
     }
     handle = gsd_find_cell(view, cell);
-    gsd_offset(view->cells[cell].pivot, view->cells[cell].nearness, position, handle.offset);
+    gsd_see_from(view, &handle, position);
     if (normal)
         gsd_orient(view, &handle, normal);
     return handle;
@@ -2687,9 +2694,8 @@ static float gsdi_sample_pdf(const gsdi_accumulation *a, const gsd_training_samp
                              const float direction[3], const float normal[3])
 {
     gsd_handle handle = gsd_find_cell(&a->view, cell);
-    if (!a->field->desc.forest_cells)
-        gsd_offset(a->view.cells[cell].pivot, a->view.cells[cell].nearness, s->position, handle.offset);
-    handle.alpha = 0; /* closed cells too */
+    gsd_see_from(&a->view, &handle, s->position); /* in a forest nearness is 0 */
+    handle.alpha = 0;                             /* closed cells too */
     gsd_orient(&a->view, &handle, normal);
     return gsd_pdf(&a->view, &handle, direction);
 }
@@ -4084,7 +4090,8 @@ static void gsdi_write_trees(void *context, uint32_t begin, uint32_t end)
 }
 
 /* What a cell of the block says to queries. */
-static void gsdi_cell_write(gsdi_block *b, const gsdi_tree *trees, gsd_cell *cell, const gsdi_state *s, uint32_t tree)
+static void gsdi_cell_write(gsdi_block *b, const gsdi_tree *trees, gsd_cell *cell, const gsdi_state *s, uint32_t tree,
+                            const float pivot[3], float nearness)
 {
     const gsdi_tree *t = &trees[tree];
     cell->root = t->root;
@@ -4096,7 +4103,8 @@ static void gsdi_cell_write(gsdi_block *b, const gsdi_tree *trees, gsd_cell *cel
     cell->gate = s->gate;
     cell->reflected = s->reflected;
     cell->depth = t->max_depth;
-    cell->pivot[0] = cell->pivot[1] = cell->pivot[2] = cell->nearness = 0; /* the caller knows better */
+    memcpy(cell->pivot, pivot, sizeof cell->pivot);
+    cell->nearness = cell->root ? nearness : 0;
     cell->reserved[0] = cell->reserved[1] = 0;
     cell->alpha = t->groups == 0 || s->gate == GSD_GATE_CLOSED ? 1.0f : s->alpha;
 }
@@ -4135,7 +4143,6 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
         const gsdi_state *old = &r->field->states[p->source];
         const gsdi_job *job = &r->jobs[p->source];
         const gsd_cell *was = &gsdi_cells(r->field->block)[p->source];
-        gsd_cell *cell = &gsdi_cells(r->block)[i];
         gsdi_state *s = &r->states[i];
         double total = 0, share, keep = 0;
         *s = *old;
@@ -4174,9 +4181,8 @@ static void gsdi_write_cells(void *context, uint32_t begin, uint32_t end)
         }
         s->fresh = s->flow = 0;
         s->hits = 0;
-        gsdi_cell_write(r->block, r->trees, cell, s, job->tree);
-        memcpy(cell->pivot, job->rebuild ? old->pivot : was->pivot, sizeof cell->pivot);
-        cell->nearness = cell->root == 0 ? 0 : job->rebuild ? old->nearness : was->nearness;
+        gsdi_cell_write(r->block, r->trees, &gsdi_cells(r->block)[i], s, job->tree,
+                        job->rebuild ? old->pivot : was->pivot, job->rebuild ? old->nearness : was->nearness);
     }
 }
 
@@ -4592,7 +4598,8 @@ GSD_API gsd_result gsd_create(const gsd_desc *desc, gsd_field **out)
     for (i = 0; i < cells; ++i) {
         gsdi_start_state(&d, &field->states[i], i * nodes, nodes);
         gsdi_start_tree(field->child + (size_t)i * nodes, depth);
-        gsdi_cell_write(field->block, &uniform, &gsdi_cells(field->block)[i], &field->states[i], 0);
+        gsdi_cell_write(field->block, &uniform, &gsdi_cells(field->block)[i], &field->states[i], 0,
+                        field->states[i].pivot, 0);
     }
     field->stats.peak_bytes = gsdi_bytes(field->block, field->building_nodes);
     field->stats.effective_rho = d.rho;
@@ -4741,7 +4748,8 @@ GSD_API gsd_result gsd_forest_split(gsd_field *field, uint32_t parent, uint32_t 
         gsdi_start_tree(field->child + field->building_nodes, depth);
         memset(field->sum + field->building_nodes, 0, nodes * sizeof(gsdi_sum));
         field->building_nodes += nodes;
-        gsdi_cell_write(field->block, gsdi_trees(field->block), &gsdi_cells(field->block)[i], &field->states[i], 0);
+        gsdi_cell_write(field->block, gsdi_trees(field->block), &gsdi_cells(field->block)[i], &field->states[i], 0,
+                        field->states[i].pivot, 0);
     }
     field->block->cells = cells;
     s = &field->states[parent];
@@ -4874,8 +4882,7 @@ GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t
         for (i = 0; i < n; ++i) {
             uint32_t at = gsdi_at(index, start + i);
             handles[at] = gsd_find_cell(view, cell[i]);
-            gsd_offset(view->cells[cell[i]].pivot, view->cells[cell[i]].nearness,
-                       gsdi_row(positions, position_stride, at), handles[at].offset);
+            gsd_see_from(view, &handles[at], gsdi_row(positions, position_stride, at));
             if (alpha)
                 alpha[at] = handles[at].alpha;
             for (k = 0; normals && k < GSDI_BINS; k += 16)
@@ -5798,13 +5805,11 @@ static bool gsdi_state_ok(const gsd_field *field, const gsdi_state *s, const gsd
         if (!(s->cross[k] >= 0 && s->cross[k] < 1e300))
             return false;
     t = &trees[c->tree];
-    gsdi_cell_write(field->block, t, &should, s, 0);
+    gsdi_cell_write(field->block, t, &should, s, 0, c->pivot, c->nearness);
     should.tree = c->tree;
     should.alpha = c->alpha;
     should.gate = c->gate;
     should.reflected = c->reflected;
-    memcpy(should.pivot, c->pivot, sizeof should.pivot);
-    should.nearness = c->nearness;
     return memcmp(&should, c, sizeof should) == 0 && c->reflected >= 0 && c->reflected <= 1e30f && c->alpha >= 0.049f &&
            c->alpha <= 1 && c->gate <= GSD_GATE_CLOSED && gsdi_building_ok(field, s);
 }
@@ -6081,9 +6086,8 @@ GSD_API gsd_result gsd_import_trees(gsd_field *field, const gsd_tree *trees, uin
         } else if (job->copy) {
             gsdi_tree_copy(r.block, tree, old, &gsdi_trees(old)[gsdi_cells(old)[i].tree]);
         }
-        gsdi_cell_write(r.block, r.trees, &gsdi_cells(r.block)[i], &field->states[i], job->tree);
-        memcpy(gsdi_cells(r.block)[i].pivot, gsdi_cells(old)[i].pivot, 3 * sizeof(float));
-        gsdi_cells(r.block)[i].nearness = gsdi_cells(r.block)[i].root ? gsdi_cells(old)[i].nearness : 0;
+        gsdi_cell_write(r.block, r.trees, &gsdi_cells(r.block)[i], &field->states[i], job->tree,
+                        gsdi_cells(old)[i].pivot, gsdi_cells(old)[i].nearness);
     }
     memcpy((char *)r.block + r.block->trees_at, r.trees, r.tree_count * sizeof(gsdi_tree));
     gsdi_release(r.desc, field->memory);

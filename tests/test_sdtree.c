@@ -1831,7 +1831,7 @@ static void test_find_with_normals_equals_its_batch(void **state)
                 gsd_handle h = gsd_find(&v, position[i], normal[i], jitter ? u[i] : NULL);
                 gsd_handle plain = gsd_find(&v, position[i], NULL, jitter ? u[i] : NULL), by_hand;
                 by_hand = gsd_find_cell(&v, plain.cell);
-                gsd_offset(v.cells[plain.cell].pivot, v.cells[plain.cell].nearness, position[i], by_hand.offset);
+                gsd_see_from(&v, &by_hand, position[i]);
                 assert_memory_equal(&by_hand, &plain, sizeof plain);
                 gsd_orient(&v, &by_hand, normal[i]);
                 assert_memory_equal(&by_hand, &h, sizeof h);

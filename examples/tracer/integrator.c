@@ -228,10 +228,7 @@ static void trace_paths(tr_worker *w, const tr_frame *frame)
     for (int i = 0; i < w->active_count; ++i) {
         const path *p = &w->paths[w->active[i]];
         struct RTCRayHit *hit = &w->hits[w->active[i]];
-        tr_set_ray(&hit->ray, p->origin, p->direction, INFINITY);
-        hit->hit.geomID = RTC_INVALID_GEOMETRY_ID;
-        hit->hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
-        tr_rtc_intersect(frame->scene->rtc, hit);
+        tr_trace_hit(frame->scene, p->origin, p->direction, hit);
     }
     w->counters.rays += (uint64_t)w->active_count;
     w->counters.trace += tr_wall_seconds() - start;

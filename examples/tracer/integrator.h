@@ -33,6 +33,15 @@ static inline void tr_set_ray(struct RTCRay *ray, vec3 o, vec3 d, float far)
     ray->flags = 0;
 }
 
+/* The nearest hit from o along d. */
+static inline void tr_trace_hit(const tr_scene *scene, vec3 o, vec3 d, struct RTCRayHit *hit)
+{
+    tr_set_ray(&hit->ray, o, d, INFINITY);
+    hit->hit.geomID = RTC_INVALID_GEOMETRY_ID;
+    hit->hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
+    tr_rtc_intersect(scene->rtc, hit);
+}
+
 /* Leave the surface at p on the side of w, by a step that covers rounding of the hit point. */
 static inline vec3 tr_leave_surface(const tr_scene *scene, vec3 p, vec3 ng, vec3 w)
 {

@@ -79,10 +79,7 @@ static void trace(photon_worker *w, const tr_scene *scene)
     for (int i = 0; i < w->active_count; ++i) {
         const photon_path *p = &w->paths[w->active[i]];
         struct RTCRayHit *hit = &w->hits[w->active[i]];
-        tr_set_ray(&hit->ray, p->origin, p->direction, INFINITY);
-        hit->hit.geomID = RTC_INVALID_GEOMETRY_ID;
-        hit->hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
-        tr_rtc_intersect(scene->rtc, hit);
+        tr_trace_hit(scene, p->origin, p->direction, hit);
     }
 }
 
