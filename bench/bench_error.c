@@ -379,6 +379,23 @@ static bool start(const options *o, child *c, const row *task)
     return c->pid > 0;
 }
 
+/* relMSE of the scene's reference itself, as make_reference wrote it, at the size of the picture: references can be
+   larger by a whole factor, and the mean of k pixels has a k-th of their error. NaN = not known. */
+static double reference_relmse(const options *o, const char *scene)
+{
+    char path[1024], text[128], err[512];
+    double relmse;
+    int width, height;
+    tr_image reference;
+    if (!reference_file(o, scene, path, sizeof path) ||
+        !tr_exr_read_attribute(path, "referenceRelMSE", text, sizeof text) || sscanf(text, "%lf", &relmse) != 1 ||
+        !parse_size(o->size, &width, &height) || !tr_image_read(path, true, &reference, err, sizeof err))
+        return (double)NAN;
+    relmse *= (double)width * height / ((double)reference.width * reference.height);
+    tr_image_free(&reference);
+    return relmse;
+}
+
 /* The row of a child that ended. */
 static void finish(const options *o, child *c, int status, bool late)
 {
@@ -396,6 +413,7 @@ static void finish(const options *o, child *c, int status, bool late)
         snprintf(r->status, sizeof r->status, "exit %d", WEXITSTATUS(status));
     else
         strcpy(r->status, row_read_json(json, r) ? "ok" : "no statistics");
+    r->reference_relmse = reference_relmse(o, r->scene);
     c->pid = 0;
 }
 

@@ -79,6 +79,11 @@ static inline const row *find_row(const rows *all, const char *scene, const char
 
 typedef double (*row_value)(const row *r);
 static inline double value_relmse(const row *r) { return r->relmse; }
+/* Without the error that the reference has itself, where that is known and at most half of it. */
+static inline double value_relmse_less(const row *r)
+{
+    return r->reference_relmse <= 0.5 * r->relmse ? r->relmse - r->reference_relmse : (double)NAN;
+}
 static inline double value_mrae(const row *r) { return r->mrae; }
 static inline double value_spp(const row *r) { return r->spp; }
 static inline double value_seconds(const row *r) { return r->cpu_seconds; }

@@ -185,10 +185,10 @@ static void write_table(FILE *f, const plan *p, const rows *all)
 {
     static column columns[MAX_NAMES * MAX_NAMES];
     int n = columns_of(p, columns);
-    fputs(
-        "| scene | budget | method | spp | CPU s | learning s | denoise | relMSE | ratio (95 %) | MRAE | efficiency |\n"
-        "|---|---|---|---|---|---|---|---|---|---|---|\n",
-        f);
+    fputs("| scene | budget | method | spp | CPU s | learning s | denoise | relMSE | ratio (95 %) | less reference | "
+          "MRAE | "
+          "efficiency |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+          f);
     for (int s = 0; s < p->scenes.count; ++s)
         for (int b = 0; b < p->budgets.count; ++b)
             for (int c = 0; c < n; ++c) {
@@ -202,6 +202,8 @@ static void write_table(FILE *f, const plan *p, const rows *all)
                 print_estimate(f, mean_of(p, all, scene, columns[c], budget, value_denoise), "%.2f %%");
                 print_estimate(f, mean_of(p, all, scene, columns[c], budget, value_relmse), "%.4g");
                 print_ratio(f, ratio_of(p, all, scene, columns[c], columns[0], budget, value_relmse));
+                estimate less = ratio_of(p, all, scene, columns[c], columns[0], budget, value_relmse_less);
+                print_estimate(f, less, "%.3f");
                 print_estimate(f, mean_of(p, all, scene, columns[c], budget, value_mrae), "%.4g");
                 print_estimate(f, ratio_of(p, all, scene, columns[c], columns[0], budget, value_efficiency), "%.2fx");
                 fputc('\n', f);
@@ -224,8 +226,8 @@ static void write_overall(FILE *f, const plan *p, const rows *all)
     int n = columns_of(p, columns);
     fprintf(f,
             "\nRatios to `%s`, geometric means over scenes (95 %% for these scenes):\n\n"
-            "| budget | method | scenes | relMSE | lowest | highest | MRAE | CPU s | denoise, most |\n"
-            "|---|---|---|---|---|---|---|---|---|\n",
+            "| budget | method | scenes | relMSE | lowest | highest | less reference | MRAE | CPU s | denoise, most |\n"
+            "|---|---|---|---|---|---|---|---|---|---|\n",
             columns[0].method);
     for (int b = 0; b < p->budgets.count; ++b)
         for (int c = 1; c < n; ++c) {
@@ -237,6 +239,8 @@ static void write_overall(FILE *f, const plan *p, const rows *all)
             print_ratio(f, o.mean);
             print_estimate(f, (estimate){o.lowest, 0, 0, 1}, "%.3f");
             print_estimate(f, (estimate){o.highest, 0, 0, 1}, "%.3f");
+            o = overall_ratio(p, all, columns[c], columns[0], budget, value_relmse_less);
+            print_estimate(f, o.mean, "%.3f");
             print_ratio(f, overall_ratio(p, all, columns[c], columns[0], budget, value_mrae).mean);
             print_ratio(f, overall_ratio(p, all, columns[c], columns[0], budget, value_seconds).mean);
             print_estimate(f, most(p, all, columns[c], budget, value_denoise), "%.2f %%");
@@ -248,7 +252,10 @@ static void write_overall(FILE *f, const plan *p, const rows *all)
 static void write_tables(FILE *f, const plan *p, const rows *all)
 {
     write_table(f, p, all);
-    fputs("\nlearning s: CPU seconds until the last update; denoise: its step's share of them\n", f);
+    fputs(
+        "\nlearning s: CPU seconds until the last update; denoise: its step's share of them; less reference: ratio of "
+        "what is\nleft without the relMSE of the reference itself, where that is known and at most half\n",
+        f);
     if (p->methods.count * p->builds.count > 1)
         write_overall(f, p, all);
 }

@@ -50,7 +50,8 @@ static inline FILE *open_in(const char *folder, const char *name)
     X(zeros)                                                                                                           \
     X(lookahead_cells)                                                                                                 \
     X(levels)                                                                                                          \
-    X(lobes)
+    X(lobes)                                                                                                           \
+    X(reference_relmse)
 
 typedef struct row {
     char scene[64], build[32], method[128];

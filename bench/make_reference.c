@@ -6,11 +6,13 @@
    the reference itself has. Rounds go on until that is small against the error to be measured (--ratio). Every fourth
    round is of another method, and tiles of both means must agree. After each round the sums are kept in --state, so
    that a later call goes on where this one stopped; the result is the same, bit for bit, as without the interruption.
+   Where the sums are gone, --add has the picture that they made take part.
 
      >>options   command line
      >>settings  what a state belongs to: text and hash
      >>round     one render in a process of its own: a crash or a lack of memory costs one round; the scene's files
      >>state     sums on disk
+     >>added     an earlier picture that takes part
      >>error     relMSE of the mean, and of the run that is to be measured
      >>check     z-test over tiles
      >>output    EXR with its history, heat map
@@ -44,7 +46,7 @@
 enum { MAIN, CHECK, METHODS };
 
 typedef struct options {
-    const char *scene, *out, *method, *check, *check_scene, *rr;
+    const char *scene, *out, *method, *check, *check_scene, *add, *rr;
     const char *state_dir;
     bool cache, quiet, no_nee;
     int width, height, max_depth, threads, rounds;
@@ -74,6 +76,9 @@ static const char usage_text[] =
     "  --round-seconds S      CPU seconds of a round, about (default 60)\n"
     "  --round-spp N, --check-spp N   samples of a round instead\n"
     "  --state DIR            where sums are kept (default out/references)\n"
+    "  --add OLD.exr          take an earlier reference of the same scene in, made with another --seed; it and the "
+    "rounds\n"
+    "                         weigh by 1 / their own relMSE\n"
     "  --cache                write DIR/HASH.exr, for scenes that are not part of the project, instead of -o\n"
     "  --seed N, --threads N, --quiet\n"
     "exit status: 0 = as good as asked for, 2 = written but not yet so good (call it again), 1 = refused or failed\n";
@@ -112,7 +117,8 @@ static bool apply_text(options *o, const char *name, const char *value)
     struct {
         const char *name, **to;
     } texts[] = {{"-o", &o->out},        {"--output", &o->out},      {"--method", &o->method},
-                 {"--check", &o->check}, {"--state", &o->state_dir}, {"--check-scene", &o->check_scene}};
+                 {"--check", &o->check}, {"--state", &o->state_dir}, {"--check-scene", &o->check_scene},
+                 {"--add", &o->add}};
     for (size_t i = 0; i < sizeof texts / sizeof texts[0]; ++i)
         if (!strcmp(name, texts[i].name)) {
             *texts[i].to = value;
@@ -641,11 +647,59 @@ static void state_add(state *s, int method, const answer *a, const float *pixels
     s->h.bad += a->bad;
 }
 
+/* ---- >>added ------------------------------------------------------------------------------------------------- */
+
+#define ALIKE 4.0 /* a picture that differs by more than so many times the errors of both is of something else */
+
+/* An earlier reference, made with other seeds. It is independent of the rounds: they weigh by 1 / relMSE. */
+typedef struct added {
+    tr_image image;
+    double relmse;    /* its own; 0 = there is none */
+    char made[16384]; /* its command, and of what it had taken in itself */
+} added;
+
+/* Was a command among those of `made` given this seed? */
+static bool made_with(const char *made, uint64_t seed)
+{
+    char option[40];
+    snprintf(option, sizeof option, " --seed %llu ", (unsigned long long)seed);
+    return strstr(made, option) != NULL;
+}
+
+static int added_open(added *a, const options *o)
+{
+    char err[512], relmse[128], before[sizeof a->made / 2];
+    *a = (added){0};
+    if (!o->add)
+        return 0;
+    if (!tr_image_read(o->add, true, &a->image, err, sizeof err))
+        return die("%s", err);
+    if (a->image.width != o->width || a->image.height != o->height)
+        return die("%s: is %dx%d, not %dx%d; choose that --size", o->add, a->image.width, a->image.height, o->width,
+                   o->height);
+    if (!tr_exr_read_attribute(o->add, "referenceRelMSE", relmse, sizeof relmse) ||
+        !tr_exr_read_attribute(o->add, "referenceCommand", a->made, sizeof a->made / 2) ||
+        sscanf(relmse, "%lf", &a->relmse) != 1 || !(a->relmse > 0))
+        return die("%s: does not tell its own error and how it was made; only pictures of make_reference can be added",
+                   o->add);
+    if (tr_exr_read_attribute(o->add, "referenceAdded", before, sizeof before)) {
+        size_t n = strlen(a->made);
+        snprintf(a->made + n, sizeof a->made - n, " | %s", before);
+    }
+    if (made_with(a->made, o->seed))
+        return die("%s: was made with --seed %llu, so the rounds would be the same; choose another --seed", o->add,
+                   (unsigned long long)o->seed);
+    return 0;
+}
+
 /* ---- >>error ------------------------------------------------------------------------------------------------ */
 
 typedef struct quality {
     tr_error own;    /* relmse of the reference itself */
     double measured; /* relmse that is to be measured; 0 = not known */
+    double share;    /* weight of the rounds; the rest is the added picture's */
+    double apart;    /* relmse of the added picture against the rounds; 0 = there is none */
+    double rounds;   /* relmse of the rounds' mean */
     bool known, reached;
 } quality;
 
@@ -658,14 +712,15 @@ static void mean_variance(const state *s, int method, size_t i, double *mean, do
     *variance = v > 0 ? v / (n - 1.0) : 0;
 }
 
-static bool mean_image(const state *s, tr_image *image)
+/* Of the rounds; with share < 1 the added picture has the rest of the weight. */
+static bool mean_image(const state *s, const added *a, double share, tr_image *image)
 {
     double variance, mean;
     if (!tr_image_alloc(image, s->h.width, s->h.height, 3))
         return die("out of memory for the picture"), false;
     for (size_t i = 0; i < s->n; ++i) {
         mean_variance(s, MAIN, i, &mean, &variance);
-        image->data[i] = (float)mean;
+        image->data[i] = (float)(share < 1 ? share * mean + (1 - share) * (double)a->image.data[i] : mean);
     }
     return true;
 }
@@ -697,27 +752,44 @@ static bool own_error(const state *s, tr_error *own)
     return true;
 }
 
+/* relMSE of a picture against the rounds' mean. */
+static bool against_rounds(const state *s, const tr_image *picture, const char *what, double *relmse)
+{
+    tr_image mean = {0};
+    tr_error e = {0};
+    char err[512];
+    bool ok = mean_image(s, NULL, 1, &mean);
+    if (ok && !tr_image_error(picture, &mean, &e, err, sizeof err))
+        ok = (die("%s: %s", what, err), false);
+    tr_image_free(&mean);
+    *relmse = e.relmse;
+    return ok;
+}
+
 /* Where a run is measured against the mean so far, the mean's error is in the figure and is taken out, as far as that
    can be believed. */
-static bool judge(const options *o, const state *s, quality *q)
+static bool judge(const options *o, const state *s, const added *a, quality *q)
 {
-    tr_image mean = {0}, run = {s->h.width, s->h.height, 3, s->run};
-    tr_error e;
-    char err[512];
-    *q = (quality){.measured = o->measured};
+    tr_image run = {s->h.width, s->h.height, 3, s->run};
+    *q = (quality){.measured = o->measured, .share = 1};
     if (s->h.rounds[MAIN] < 2)
         return true;
     if (!own_error(s, &q->own))
         return false;
     q->known = true;
+    q->rounds = q->own.relmse;
     if (!(q->measured > 0) && s->h.run_cpu > 0) {
-        bool ok = mean_image(s, &mean);
-        if (ok && !tr_image_error(&run, &mean, &e, err, sizeof err))
-            ok = (die("the measured run: %s", err), false);
-        tr_image_free(&mean);
-        if (!ok)
+        double relmse;
+        if (!against_rounds(s, &run, "the measured run", &relmse))
             return false;
-        q->measured = fmax(e.relmse - q->own.relmse, 0.5 * e.relmse);
+        q->measured = fmax(relmse - q->own.relmse, 0.5 * relmse);
+    }
+    if (a->relmse > 0) {
+        if (!against_rounds(s, &a->image, o->add, &q->apart))
+            return false;
+        q->share = a->relmse / (a->relmse + q->rounds);
+        q->own.relmse *= q->share;
+        q->own.relmse_untrimmed *= q->share;
     }
     q->reached = s->h.rounds[MAIN] >= MIN_ROUNDS && q->own.relmse * o->ratio <= q->measured;
     return true;
@@ -882,17 +954,29 @@ static int refuse(const options *o, const state *s, const verdict *c)
     return PROGRAM_FAILED;
 }
 
-static int write_reference(const options *o, const state *s, const quality *q, const verdict *c)
+/* Is the added picture one of the same scene? */
+static int check_added(const options *o, const added *a, const quality *q)
+{
+    if (q->apart <= ALIKE * (a->relmse + q->rounds))
+        return 0;
+    return die("%s: not written: %s differs from the rounds by relMSE %.3g, where both errors make %.3g: is it of this "
+               "scene and these settings?",
+               o->out, o->add, q->apart, a->relmse + q->rounds);
+}
+
+static int write_reference(const options *o, const state *s, const added *a, const quality *q, const verdict *c)
 {
     tr_image mean;
     text command = {.n = 0};
-    char relmse[128], samples[128], check[192], goal[128], err[512];
+    char relmse[128], samples[128], check[192], goal[128], taken_in[sizeof a->made + 128], err[512];
     const char *slash = strrchr(o->out, '/');
     append(&command, "make_reference %s ", o->scene);
     settings_text(o, &command);
     if (o->check_scene)
         append(&command, " --check-scene %s", o->check_scene);
     append(&command, " --round-spp %d --check-spp %d --rounds %d", s->h.spp[MAIN], s->h.spp[CHECK], total_rounds(s));
+    if (o->add)
+        append(&command, " --add %s", o->add);
     append(&command, " --measured %.4g --ratio %g -o %s", q->measured, o->ratio, slash ? slash + 1 : o->out);
     snprintf(relmse, sizeof relmse, "%.4g (untrimmed %.4g)", q->own.relmse, q->own.relmse_untrimmed);
     snprintf(samples, sizeof samples, "%lld spp = %d rounds of %d, %llu bad samples",
@@ -901,16 +985,16 @@ static int write_reference(const options *o, const state *s, const quality *q, c
     snprintf(goal, sizeof goal, "1/%g of %.4g: %s", o->ratio, q->measured, q->reached ? "reached" : "not reached");
     snprintf(check, sizeof check, "%.32s, %lld spp: %d tiles agree, %d left out, worst z %.2f, allowed %.2f", o->check,
              (long long)s->h.spp[CHECK] * s->h.rounds[CHECK], c->tested, c->left_out, c->worst, c->limit);
-    const tr_attribute attributes[] = {{"referenceCommand", command.s},
-                                       {"referenceRelMSE", relmse},
-                                       {"referenceGoal", goal},
-                                       {"referenceSamples", samples},
-                                       {"referenceCheck", check}};
-    if (!mean_image(s, &mean))
+    snprintf(taken_in, sizeof taken_in, "own relMSE %.4g, from the rounds by %.4g, weight %.3f: %s", a->relmse,
+             q->apart, 1 - q->share, a->made);
+    const tr_attribute attributes[] = {{"referenceCommand", command.s}, {"referenceRelMSE", relmse},
+                                       {"referenceGoal", goal},         {"referenceSamples", samples},
+                                       {"referenceCheck", check},       {"referenceAdded", taken_in}};
+    int count = (int)(sizeof attributes / sizeof attributes[0]) - (a->relmse > 0 ? 0 : 1);
+    if (!mean_image(s, a, q->share, &mean))
         return PROGRAM_FAILED;
     const tr_layer layer = {"R,G,B", &mean, false};
-    bool ok = tr_exr_write_attributes(o->out, &layer, 1, attributes, (int)(sizeof attributes / sizeof attributes[0]),
-                                      err, sizeof err);
+    bool ok = tr_exr_write_attributes(o->out, &layer, 1, attributes, count, err, sizeof err);
     tr_image_free(&mean);
     if (!ok)
         return die("%s: cannot write the picture: %s", o->out, err);
@@ -928,6 +1012,7 @@ static int write_reference(const options *o, const state *s, const quality *q, c
 typedef struct session {
     const options *o;
     state s;
+    added added;
     float *pixels;
     double used, wall; /* CPU and wall-clock seconds of this call */
     bool said;         /* the scene's messages have been shown */
@@ -994,7 +1079,7 @@ static bool measure_run(session *w)
     return state_save(&w->s);
 }
 
-/* relMSE falls as 1 / time, and a part of the time is the check's. */
+/* The rounds' relMSE falls as 1 / time, and a part of the time is the check's. */
 static void show(const session *w, int method, const quality *q, const verdict *c)
 {
     const state *s = &w->s;
@@ -1003,7 +1088,8 @@ static void show(const session *w, int method, const quality *q, const verdict *
     fprintf(stderr, "round %d (%s), %.0f CPU s", total_rounds(s), method == MAIN ? w->o->method : w->o->check, w->used);
     if (q->known) {
         double spent = s->h.cpu[MAIN] + s->h.cpu[CHECK], goal = q->measured / w->o->ratio;
-        double left = goal > 0 ? fmax(spent * (q->own.relmse / goal - 1), 0) : 0;
+        double known = w->added.relmse > 0 ? 1 / w->added.relmse : 0; /* precision; the rounds have to bring the rest */
+        double left = goal > 0 ? fmax(spent * (q->rounds * (1 / goal - known) - 1), 0) : 0;
         fprintf(stderr, ": own relMSE %.3g, wanted %.3g (1/%g of %.3g)", q->own.relmse, goal, w->o->ratio, q->measured);
         fprintf(stderr, q->reached ? ", reached" : ", about %.0f CPU s = %.0f s to go", left,
                 left * w->wall / fmax(w->used, 1e-3));
@@ -1033,7 +1119,7 @@ static bool run_rounds(session *w, quality *q, verdict *c)
 {
     state *s = &w->s;
     double start = tr_wall_seconds(), last = 0;
-    if (!find_spp(w) || !measure_run(w) || !judge(w->o, s, q) || !run_check(s, c))
+    if (!find_spp(w) || !measure_run(w) || !judge(w->o, s, &w->added, q) || !run_check(s, c))
         return false;
     while (!finished(w, q) && !(w->o->seconds > 0 && w->used + 0.5 * last >= w->o->seconds)) {
         answer a;
@@ -1048,7 +1134,7 @@ static bool run_rounds(session *w, quality *q, verdict *c)
         start = tr_wall_seconds();
         free(c->tiles);
         c->tiles = NULL;
-        if (!state_save(s) || !judge(w->o, s, q) || !run_check(s, c))
+        if (!state_save(s) || !judge(w->o, s, &w->added, q) || !run_check(s, c))
             return false;
         show(w, method, q, c);
     }
@@ -1063,7 +1149,7 @@ static int conclude(const session *w, const quality *q, const verdict *c)
                    o->out, w->s.h.rounds[MAIN], o->method);
     if (c->failed)
         return refuse(o, &w->s, c);
-    if (write_reference(o, &w->s, q, c))
+    if (check_added(o, &w->added, q) || write_reference(o, &w->s, &w->added, q, c))
         return PROGRAM_FAILED;
     if (!q->reached)
         fprintf(stderr, "make_reference: %s is not good enough yet: call it again, with more --seconds or --rounds\n",
@@ -1103,7 +1189,10 @@ int main(int argc, char **argv)
         }
     if (parse(&o, argc, argv) || hash_settings(&o, &key) || (o.out && check_output(&o)) || hash_files(&o, &key))
         return PROGRAM_FAILED;
-    session w = {.o = &o};
+    static session w;
+    w.o = &o;
+    if (added_open(&w.added, &o))
+        return PROGRAM_FAILED;
     int rc = state_open(&w.s, &o, key);
     if (o.cache) {
         snprintf(cache_path, sizeof cache_path, "%s/%016llx.exr", o.state_dir, (unsigned long long)key);
@@ -1116,6 +1205,7 @@ int main(int argc, char **argv)
         rc = run_rounds(&w, &q, &c) ? conclude(&w, &q, &c) : PROGRAM_FAILED;
     free(c.tiles);
     free(w.pixels);
+    tr_image_free(&w.added.image);
     state_close(&w.s);
     return rc;
 }

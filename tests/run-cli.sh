@@ -288,7 +288,8 @@ refuses 'make_reference: bad size' 'size' good.xml -o r.exr --size 64
 refuses 'make_reference: missing scene' 'absent\.xml' absent.xml -o r.exr
 refuses 'make_reference: unwritable output, before any round' 'absent/r\.exr' good.xml -o absent/r.exr --state parts
 refuses 'make_reference: broken scene' 'broken\.xml:3' broken.xml -o r.exr --state parts --round-spp 1
-make="good.xml --size 64x36 --round-spp 8 --check-spp 8 --quiet --measured 0.5"
+make_options="--size 64x36 --round-spp 8 --check-spp 8 --quiet --measured 0.5"
+make="good.xml $make_options"
 completes 'make_reference: as good as asked for' $make --state whole -o whole/r.exr --rounds 16 --ratio 2
 grep -aq 'make_reference good.xml --size 64x36.*--rounds 16.*-o r.exr' whole/r.exr && grep -aq '96 spp = 12 rounds of 8' whole/r.exr
 report $? 'make_reference: the header tells the command and the samples'
@@ -310,6 +311,18 @@ report $? 'make_reference: killed, the same picture'
 "$program" $make --state whole -o whole/far.exr --rounds 16 --ratio 1e6 >out 2>log
 [ $? -eq 2 ] && grep -q 'not good enough' log && grep -aq 'not reached' whole/far.exr
 report $? 'make_reference: a reference that is not good enough says so'
+completes 'make_reference: --add takes an earlier picture in' $make --state parts -o parts/sum.exr --rounds 16 --ratio 2 \
+    --seed 2 --add whole/r.exr
+"$imgerr" parts/sum.exr whole/r.exr >out 2>log && grep -aq 'weight 0\.[345].*--seed 1000000 ' parts/sum.exr
+report $? 'make_reference: the header tells what was added'
+refuses 'make_reference: the same rounds are not added twice' 'seed 1000000.*choose another' $make --state parts -o parts/no.exr \
+    --add parts/sum.exr
+sed 's/4,4,4/9,9,9/' good.xml >bright.xml
+refuses 'make_reference: a picture of another scene is not added' 'differs from the rounds' bright.xml $make_options --seed 2 \
+    --state parts -o parts/no.exr --rounds 16 --add whole/r.exr
+"$render" good.xml --size 64x36 --spp 1 -o plain.exr >out 2>log
+refuses 'make_reference: only a reference is added' 'does not tell its own error' $make --state parts -o parts/no.exr --seed 2 \
+    --add plain.exr
 sed 's/4,4,4/4,4,4.2/' good.xml >brighter.xml
 refuses 'make_reference: a check with more blue light refuses' 'not written.*differ' $make --state biased -o biased/r.exr \
     --check-scene brighter.xml --rounds 16 --ratio 2

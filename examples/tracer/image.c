@@ -348,12 +348,9 @@ static bool read_exr_header(exr_reader *r, const char *path, exr_storage_t *stor
     return true;
 }
 
-static bool read_exr(const char *path, blob *b, const char *layer, tr_image *image, char *err, size_t err_size)
+/* Reads the header; where that fails, there is nothing to finish. */
+static exr_result_t start_exr(exr_context_t *context, const char *path, blob *b)
 {
-    exr_reader r;
-    memset(&r, 0, sizeof r);
-    r.layer = layer;
-    r.image = image;
     exr_context_initializer_t init = EXR_DEFAULT_CONTEXT_INITIALIZER;
     init.error_handler_fn = exr_silent;
     init.user_data = b;
@@ -361,7 +358,16 @@ static bool read_exr(const char *path, blob *b, const char *layer, tr_image *ima
     init.size_fn = exr_size_blob;
     init.max_image_width = init.max_image_height = IMAGE_MAX_SIDE;
     init.flags = EXR_CONTEXT_FLAG_SILENT_HEADER_PARSE | EXR_CONTEXT_FLAG_DISABLE_CHUNK_RECONSTRUCTION;
-    exr_result_t rv = exr_start_read(&r.context, path, &init);
+    return exr_start_read(context, path, &init);
+}
+
+static bool read_exr(const char *path, blob *b, const char *layer, tr_image *image, char *err, size_t err_size)
+{
+    exr_reader r;
+    memset(&r, 0, sizeof r);
+    r.layer = layer;
+    r.image = image;
+    exr_result_t rv = start_exr(&r.context, path, b);
     if (rv != EXR_ERR_SUCCESS)
         return exr_fail(path, "damaged EXR header", rv, err, err_size);
     exr_storage_t storage = EXR_STORAGE_SCANLINE;
@@ -455,6 +461,24 @@ bool tr_exr_read_layer(const char *path, const char *layer, tr_image *image, cha
     blob b = {0};
     memset(image, 0, sizeof *image);
     bool ok = blob_read_file(&b, path, err, err_size) && read_exr(path, &b, layer, image, err, err_size);
+    free(b.data);
+    return ok;
+}
+
+bool tr_exr_read_attribute(const char *path, const char *name, char *value, size_t size)
+{
+    blob b = {0};
+    exr_context_t context;
+    const char *text = NULL;
+    char err[256];
+    int32_t length = 0;
+    bool ok = blob_read_file(&b, path, err, sizeof err) && start_exr(&context, path, &b) == EXR_ERR_SUCCESS;
+    if (ok) {
+        ok = exr_attr_get_string(context, 0, name, &length, &text) == EXR_ERR_SUCCESS && text;
+        if (ok)
+            snprintf(value, size, "%.*s", (int)length, text);
+        exr_finish(&context);
+    }
     free(b.data);
     return ok;
 }

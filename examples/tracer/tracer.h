@@ -79,6 +79,8 @@ typedef struct tr_attribute {
 } tr_attribute;
 bool tr_exr_write_attributes(const char *path, const tr_layer *layers, int layer_count, const tr_attribute *attributes,
                              int attribute_count, char *err, size_t err_size);
+/* One of them, cut where it does not fit; false = not an EXR, or it has no such string. */
+bool tr_exr_read_attribute(const char *path, const char *name, char *value, size_t size);
 /* Tone-mapped PNG: exposure, then sRGB curve, clipped. exposure <= 0 picks one from the image's mean luminance. */
 bool tr_png_write(const char *path, const tr_image *image, float exposure, char *err, size_t err_size);
 float tr_auto_exposure(const tr_image *image);
