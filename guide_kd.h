@@ -34,7 +34,7 @@
        }
 
    CONTENTS (search for the tag)
-     >>config    macros, versions              >>query   inline: find, sample, pdf
+     >>config    macros, versions              >>query   inline: find, sample, pdf, resample
      >>types     descriptor, sample, results   >>batch   find, sample, pdf of arrays
      >>field     create, refine, stats         >>store   save, load, merge
      implementation:
@@ -74,6 +74,15 @@
 
      Selection probability: handle.alpha is the probability to sample the BSDF; 1 means: do not guide here. The caller
      draws from the BSDF with alpha, else from gkd_sample, and divides by alpha pdf_bsdf + (1 - alpha) gkd_pdf.
+
+     Resampling (RIS) [Talbot 2005], in place of choosing between BSDF and guide blindly, pays where the BSDF is glossy:
+     draw n candidates, number i from the BSDF with probability clamp(alpha n - i, 0, 1), else from gkd_sample;
+     evaluate both densities and the BSDF at each; gkd_resample takes one by f cos L, as the guide sees L. Divide by the
+     pdf that it returns, and record this as pdf_mix: both stay unbiased. It is not a density that could be known of any
+     other direction. MIS with other techniques weighs therefore by m = alpha pdf_bsdf + (1 - alpha) gkd_pdf, on both
+     sides: weights have to sum to 1 for each direction, no more, as the quotient by the returned pdf is an unbiased
+     estimate of any integral, that with a weight too. On diffuse surfaces there is nothing to gain: n = 1 is
+     one-sample MIS.
 
      Gate: guiding is used in a cell until its own samples show that it does not pay. V(a) = mean of g^2 / (p p_a), with
      g = contribution, p_a = a pdf_bsdf + (1 - a) pdf_guide, is the second moment with selection probability a; m = mean
@@ -124,6 +133,7 @@
      L. Ruppert, S. Herholz, H. Lensch 2020, Robust Fitting of Parallax-Aware Mixtures for Path Guiding.
      F. Zheng, C. Peters, S. Herholz, M. Manzi, E. Eisemann 2025, Illumination-Aware Spatial Subdivision for Path
      Guiding.
+     J. Talbot, D. Cline, P. Egbert 2005, Importance Resampling for Global Illumination.
      J. Vorba, J. Krivanek 2016, Adjoint-Driven Russian Roulette and Splitting in Light Transport Simulation.
      F. Downton 1973, The Estimation of Pr(Y < X) in the Normal Case. */
 #ifndef GUIDE_KD_H
@@ -231,7 +241,7 @@ typedef struct gkd_training_sample {
     float radiance;           /* largest channel of L; GKD_REJECTED */
     float contribution;       /* mean over channels of f L cos */
     float pixel_contribution; /* mean over channels of f L cos * throughput before this vertex / pixel estimate */
-    float pdf_mix;            /* what the direction was drawn with */
+    float pdf_mix;            /* what the direction was drawn with, or gkd_resample's */
     float pdf_bsdf;
     float pdf_guide; /* 0 = not evaluated */
 } gkd_training_sample;
@@ -816,6 +826,52 @@ GKD_QUERY float gkd_sample(const gkd_handle *handle, const float u[2], float dir
         return gkd_sample_one(handle, u, direction);
 #endif
     return gkd_sample_scalar(handle, u, direction);
+}
+
+/* Resample */
+
+/* One of several directions that might be taken. */
+typedef struct gkd_candidate {
+    float pdf_bsdf, pdf_guide; /* densities of the direction, 1/sr: sampling the BSDF's; gkd_pdf */
+    float f;                   /* mean over channels of the BSDF there, without cosine; 0 where drawing failed */
+    float cosine;              /* with the normal that gkd_find got. Without one, or with view.no_product: 1, the cosine
+                                  in f */
+} gkd_candidate;
+
+/* What candidates are chosen by: the BSDF times the radiance and cosine as the guide sees them, of which a share is
+   taken to be even, for the guide may be wrong. The guide's density holds the cosine. */
+#define GKD_RESAMPLE_GUIDE 0.9f /* tuned on a glossy scene (0.5 .. 0.95) */
+GKD_QUERY float gkd_candidate_target(const gkd_candidate *c)
+{
+    float target =
+        c->f * (GKD_RESAMPLE_GUIDE * c->pdf_guide + (1 - GKD_RESAMPLE_GUIDE) * (1 / GKD_PI) * gkd_most(c->cosine, 0));
+    return target > 0 && target < 1e30f ? target : 0;
+}
+
+/* Choose one of `count` candidates (at least 1), u in [0,1): see RESAMPLING. Returns its index and in *pdf what its
+   contribution is to be divided by; `count` and 0 where none can be taken: the contribution is 0. [any thread] */
+GKD_QUERY uint32_t gkd_resample(const gkd_candidate *candidates, uint32_t count, float alpha, float u, float *pdf)
+{
+    float sum = 0, chosen = 0;
+    uint32_t i, index = count;
+    for (i = 0; i < count; ++i) {
+        const gkd_candidate *c = &candidates[i];
+        float target = gkd_candidate_target(c), mix = alpha * c->pdf_bsdf + (1 - alpha) * c->pdf_guide;
+        float weight = mix > 0 ? target / mix : 0, p;
+        if (!(weight > 0 && sum + weight < 1e30f))
+            continue;
+        sum += weight;
+        p = weight / sum;
+        if (u < p) { /* what remains of u is uniform again */
+            u = u / p;
+            index = i;
+            chosen = target;
+        } else {
+            u = (u - p) / (1 - p);
+        }
+    }
+    *pdf = sum > 0 ? (float)count * chosen / sum : 0;
+    return index;
 }
 
 /* Leaf of the tree at a position. NaN goes up. [any thread] */
@@ -5725,7 +5781,7 @@ static gkdi_options gkdi_options_of(const gkd_desc *d)
     o.split_samples = d->split_samples;
     o.lookahead = d->lookahead;
     o.min_samples = d->min_samples;
-    o.flags = (d->no_radiance_test ? 1u : 0) | (d->no_direction_test ? 2u : 0) | (d->keep_signatures ? 4u : 0) |
+    o.flags = (d->no_radiance_test ? 1u : 0) | (d->no_direction_test ? 2u : 0) | (d->keep_signatures > 0 ? 4u : 0) |
               (d->no_mixtures ? 8u : 0) | (d->no_gate ? 16u : 0) | (d->published_tests ? 32u : 0) |
               (d->no_prune ? 64u : 0) | (d->no_rest ? 128u : 0);
     o.max_levels = d->max_levels;

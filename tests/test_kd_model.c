@@ -446,6 +446,130 @@ static void test_draws_of_mixtures_follow_the_density(void **state)
     }
 }
 
+/* ---- resampling */
+
+enum { GLOSS = 20, DRAWN = 6, PARTS = 8 };
+
+/* A BSDF about z whose f times cosine is (GLOSS + 2) / (2 pi) cos^(GLOSS + 1), sampled by (DRAWN + 1) / (2 pi)
+   cos^DRAWN: resampling must make up for the difference. */
+static void fill_candidate(const gkd_handle *h, const float w[3], gkd_candidate *c)
+{
+    const double up = fmax((double)w[2], 0);
+    c->cosine = (float)up;
+    c->f = (float)((GLOSS + 2) / (2 * PI) * pow(up, GLOSS));
+    c->pdf_bsdf = (float)((DRAWN + 1) / (2 * PI) * pow(up, DRAWN));
+    c->pdf_guide = gkd_pdf(h, w);
+}
+
+/* One direction chosen of n, as the header tells; returns what its contribution is to be divided by, 0 = none. */
+static float resampled(const gkd_handle *h, float alpha, uint32_t n, float direction[3])
+{
+    gkd_candidate c[8];
+    float w[8][3], pdf;
+    uint32_t i, chosen;
+    for (i = 0; i < n; ++i) {
+        const float u[2] = {rndf(), rndf()};
+        if (rnd() < (double)alpha * n - i) {
+            const double z = pow((double)u[0], 1.0 / (DRAWN + 1)), r = sqrt(1 - z * z), phi = 2 * PI * (double)u[1];
+            const double d[3] = {r * cos(phi), r * sin(phi), z};
+            floats(d, w[i]);
+        } else {
+            gkd_sample(h, u, w[i]);
+        }
+        fill_candidate(h, w[i], &c[i]);
+    }
+    chosen = gkd_resample(c, n, alpha, rndf(), &pdf);
+    assert_true(chosen < n ? pdf > 0 : pdf == 0);
+    memcpy(direction, w[chosen < n ? chosen : 0], sizeof *w);
+    return pdf;
+}
+
+/* Rings of z that f times cosine fills with 1 / PARTS each: what is estimated of them must be that, for any number of
+   candidates, selection probability and guide. */
+static void test_resampling_is_unbiased(void **state)
+{
+    static const float alphas[] = {0.05f, 0.3f, 0.5f, 0.8f, 1};
+    const float up[3] = {0, 0, 1};
+    const int trials = 60000;
+    (void)state;
+    seed(31);
+    for (uint32_t n = 1; n <= 8; n = n < 2 ? 2 : 2 * n)
+        for (unsigned a = 0; a < 5; ++a) {
+            double sum[PARTS] = {0}, squares[PARTS] = {0}, worst = 0;
+            gkd_lobe l[GKD_MAX_LOBES];
+            gkd_handle h;
+            handle_of(&h, l, any_lobes(l, 8), origin, up, a & 1, 0.01f);
+            for (int i = 0; i < trials; ++i) {
+                float w[3], pdf = resampled(&h, alphas[a], n, w);
+                gkd_candidate c;
+                if (!(pdf > 0))
+                    continue;
+                fill_candidate(&h, w, &c);
+                double x = (double)c.f * (double)c.cosine / (double)pdf, z = (double)w[2];
+                int part = (int)fmin(pow(z, GLOSS + 2) * PARTS, PARTS - 1);
+                sum[part] += x;
+                squares[part] += x * x;
+            }
+            for (int k = 0; k < PARTS; ++k) {
+                double mean = sum[k] / trials, variance = (squares[k] / trials - mean * mean) / trials;
+                worst = fmax(worst, fabs(mean - 1.0 / PARTS) / sqrt(variance));
+            }
+            BELOW(worst, 4.6); /* 160 of them: by chance 7e-4 */
+        }
+}
+
+/* Where the guide knows the light, the product is sampled better the more candidates there are; one candidate is
+   one-sample MIS. */
+static void test_resampling_follows_the_product(void **state)
+{
+    const float up[3] = {0, 0, 1};
+    double variance[3], means[3];
+    gkd_lobe l[2];
+    gkd_handle h;
+    (void)state;
+    seed(32);
+    l[0] = make_lobe(up, 2, 0.5f, 0);
+    l[1] = make_lobe((const float[3]){0.8f, 0, 0.6f}, 100, 0.5f, 0);
+    handle_of(&h, l, 2, origin, up, true, 0.01f);
+    for (int i = 0; i < 3; ++i) {
+        double sum = 0, squares = 0;
+        for (int k = 0; k < 40000; ++k) {
+            float w[3], pdf = resampled(&h, 0.5f, 1u << i, w);
+            gkd_candidate c;
+            if (!(pdf > 0))
+                continue;
+            fill_candidate(&h, w, &c);
+            if (!i && c.f > 1e-30f) /* smaller ones have fewer digits */
+                assert_true(fabsf(pdf - 0.5f * (c.pdf_bsdf + c.pdf_guide)) <= 1e-5f * pdf);
+            sum += (double)c.f * (double)c.pdf_guide / (double)pdf;
+            squares += pow((double)c.f * (double)c.pdf_guide / (double)pdf, 2);
+        }
+        means[i] = sum / 40000;
+        variance[i] = squares / 40000 - means[i] * means[i];
+    }
+    BELOW(fabs(means[1] - means[0]) / sqrt((variance[0] + variance[1]) / 40000), 4.5);
+    BELOW(variance[1], 0.7 * variance[0]);
+    BELOW(variance[2], 0.7 * variance[1]);
+}
+
+/* Candidates that cannot be are never chosen and count: what the others bring is divided by more. */
+static void test_impossible_candidates_are_not_chosen(void **state)
+{
+    const gkd_candidate good = {1, 1, 0.5f, 1};
+    const gkd_candidate bad[] = {{0, 0, 0, 0},        {0, 0, 1, 1},   {1, 1, 0, 1},  {NAN, 1, 1, 1},
+                                 {1, NAN, 1, 1},      {1, 1, NAN, 1}, {1, 0, 1, -1}, {1, 1, INFINITY, 1},
+                                 {INFINITY, 1, 1, 1}, {1, 1, -1, 1}};
+    float pdf;
+    (void)state;
+    for (unsigned i = 0; i < sizeof bad / sizeof *bad; ++i) {
+        gkd_candidate c[3] = {bad[i], good, bad[i]};
+        assert_int_equal(gkd_resample(c, 3, 0.5f, 0.99f, &pdf), 1);
+        BELOW(fabs((double)pdf - 3), 1e-5);
+        assert_int_equal(gkd_resample(&bad[i], 1, 0.5f, 0.5f, &pdf), 1);
+        assert_true(pdf == 0);
+    }
+}
+
 /* Lobes that no float of 24 bits could choose between are all reached, and a lobe's first and last draws are apart. */
 static void test_numbers_are_used_to_the_last_bit(void **state)
 {
@@ -1369,6 +1493,9 @@ int main(void)
         cmocka_unit_test(test_draws_follow_the_density),
         cmocka_unit_test(test_draws_of_mixtures_follow_the_density),
         cmocka_unit_test(test_numbers_are_used_to_the_last_bit),
+        cmocka_unit_test(test_resampling_is_unbiased),
+        cmocka_unit_test(test_resampling_follows_the_product),
+        cmocka_unit_test(test_impossible_candidates_are_not_chosen),
         cmocka_unit_test(test_cosine_product_against_quadrature),
         cmocka_unit_test(test_a_source_is_found_from_other_positions),
         cmocka_unit_test(test_lobes_turn_to_what_they_show),

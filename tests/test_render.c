@@ -287,14 +287,16 @@ static double mean_alpha(const tr_result *r)
     return sum / (80 * 48);
 }
 
-static void method_agrees(const char *method, const char *scene_name, const char *define, const char *value, int spp,
-                          bool nee, int train)
+static void method_agrees_with(const char *method, tr_option *options, int option_count, const char *scene_name,
+                               const char *define, const char *value, int spp, bool nee, int train)
 {
     tr_scene *scene = load(scene_name, define, value);
     tr_settings s = small("pt", SPP(spp));
     s.no_nee = !nee;
     tr_result pt = render(scene, &s);
     s.method = tr_method_find(method);
+    s.options = options;
+    s.option_count = option_count;
     s.seed = 1;
     s.train = train;
     tr_result guided = render(scene, &s);
@@ -304,6 +306,12 @@ static void method_agrees(const char *method, const char *scene_name, const char
     tr_result_free(&pt);
     tr_result_free(&guided);
     tr_scene_free(scene);
+}
+
+static void method_agrees(const char *method, const char *scene_name, const char *define, const char *value, int spp,
+                          bool nee, int train)
+{
+    method_agrees_with(method, NULL, 0, scene_name, define, value, spp, nee, train);
 }
 
 static void guided_agrees(const char *scene_name, const char *define, const char *value, int spp, bool nee)
@@ -327,6 +335,14 @@ static void guided_agrees_on_pool(void **state) { (void)state, guided_agrees("po
 static void guided_agrees_on_maze(void **state) { (void)state, guided_agrees("maze", "lamp_z", "-2.3", 100, true); }
 static void kd_agrees_on_ajar(void **state) { (void)state, method_agrees("kd", "ajar", "gap", "120", 127, true, 0); }
 static void kd_agrees_on_egg(void **state) { (void)state, method_agrees("kd", "egg", "bulb", "0.3", 100, true, 0); }
+/* Metal: candidates from both, MIS with next event estimation by their mixture. */
+static void resampled_agrees_on_gloss(void **state)
+{
+    tr_option three[] = {{"sampling", "ris", false}, {"candidates", "3", false}};
+    (void)state;
+    method_agrees_with("kd", three, 1, "gloss", "bulb", "0.3", 100, true, 0);
+    method_agrees_with("kd", three, 2, "gloss", "bulb", "0.3", 100, false, 0);
+}
 static void photons_agree_on_ajar(void **state)
 {
     (void)state, method_agrees("photon", "ajar", "gap", "120", 127, true, 0);
@@ -572,6 +588,7 @@ int main(void)
         cmocka_unit_test(guided_agrees_on_maze),
         cmocka_unit_test(kd_agrees_on_ajar),
         cmocka_unit_test(kd_agrees_on_egg),
+        cmocka_unit_test(resampled_agrees_on_gloss),
         cmocka_unit_test(photons_agree_on_ajar),
         cmocka_unit_test(photons_agree_on_egg),
         cmocka_unit_test(splitting_changes_no_mean),

@@ -4,7 +4,8 @@
      >>intersect  trace, add emission, prepare closures
      >>find       method.find on the vertices that have a smooth part
      >>nee        sample a light, weigh it against the mixture, trace a shadow ray
-     >>scatter    roulette and splitting, then a direction from bsdf or guide: one-sample MIS (Veach 1997)
+     >>scatter    roulette and splitting, then a direction from bsdf or guide: one-sample MIS (Veach 1997), or
+                  resampling of several (Talbot et al. 2005)
      >>record     carry radiance back along each path and hand the vertices to the method
 
    Random numbers: each path has two generators. The guide draws from the second one only, so that a render whose
@@ -20,7 +21,8 @@ typedef struct path {
     tr_rng rng, guide_rng;
     vec3 origin, direction;
     vec3 throughput, radiance;
-    float pdf;      /* of `direction` by the mixture; meaningless after a delta bounce */
+    float pdf;      /* of `direction` by the mixture, resampled or not: known of every direction, so MIS with NEE uses
+                       it; meaningless after a delta bounce */
     float survival; /* product of albedos and eta^2: what roulette looks at, since guided throughput is small exactly
                        where light is expected */
     float roulette; /* weight for having survived at this vertex */
@@ -50,6 +52,21 @@ typedef struct trail {
     int join; /* link of the path it was split from, -1 = none */
 } trail;
 
+/* A direction chosen at a vertex. */
+typedef struct choice {
+    vec3 wi, f;     /* delta: f cos / probability instead of f */
+    float pdf_bsdf; /* delta: square of the relative index instead */
+    float pdf;      /* resampled: what to divide by, else 0 */
+    uint8_t kind;
+} choice;
+enum { CHOICE_NONE, CHOICE_DELTA, CHOICE_BSDF, CHOICE_GUIDE, CHOICE_RESAMPLED };
+
+/* A direction that resampling may choose. */
+typedef struct candidate {
+    choice choice;
+    float pdf_guide;
+} candidate;
+
 struct tr_worker {
     tr_counters counters;
     path paths[TR_PATHS];
@@ -68,6 +85,9 @@ struct tr_worker {
     int index[TR_PATHS];
     vec3 wi[TR_PATHS];
     float pdf_guide[TR_PATHS], sample_u[TR_PATHS][2];
+    /* Resampling: vertices that choose among candidates, which come one after another. */
+    int several[TR_PATHS], several_count;
+    candidate *candidates; /* [TR_PATHS][frame->candidates] by their place in `several`; NULL for one-sample MIS */
     /* NEE, by the same k; `lit` lists those that a light may reach. */
     int lit[TR_PATHS], lit_count;
     tr_light_sample lights[TR_PATHS];
@@ -93,6 +113,13 @@ tr_worker *tr_worker_create(const tr_frame *frame)
         return NULL;
     }
     memset(w->handles, 0, handle_size * TR_PATHS);
+    if (frame->candidates > 1) {
+        w->candidates = malloc(sizeof *w->candidates * (size_t)frame->candidates * TR_PATHS);
+        if (!w->candidates) {
+            tr_worker_destroy(w);
+            return NULL;
+        }
+    }
     return w;
 }
 
@@ -101,6 +128,7 @@ void tr_worker_destroy(tr_worker *w)
     if (!w)
         return;
     free(w->handles);
+    free(w->candidates);
     free(w->vertices);
     free(w->links);
     free(w->trails);
@@ -609,15 +637,11 @@ static void roulette(tr_worker *w, const tr_frame *frame, int depth, bool record
     w->active_count = kept;
 }
 
-/* A direction chosen at a vertex. */
-typedef struct choice {
-    vec3 wi, f;     /* delta: f cos / probability instead of f */
-    float pdf_bsdf; /* delta: square of the relative index instead */
-    uint8_t kind;
-} choice;
-enum { CHOICE_NONE, CHOICE_DELTA, CHOICE_BSDF, CHOICE_GUIDE };
+/* Whether a guided vertex chooses among several directions: where the bsdf says nothing about them there is nothing to
+   choose by. */
+static inline bool resamples(const tr_worker *w, int id) { return w->candidates && w->closures[id].roughness < 1; }
 
-/* Decide delta, bsdf or guide; draw what needs no method. */
+/* Decide delta, bsdf, guide or several candidates; draw what needs no method. */
 static inline void choose(tr_worker *w, int id, choice *ch)
 {
     path *p = &w->paths[id];
@@ -626,6 +650,7 @@ static inline void choose(tr_worker *w, int id, choice *ch)
     rng_float2(&p->rng, &u0, &u1);
     rng_float2(&p->rng, &u2, &u3);
     ch->kind = CHOICE_NONE;
+    ch->pdf = 0;
     if (u0 < c->delta_probability) {
         if (tr_closure_sample_delta(c, u1, &ch->wi, &ch->f, &ch->pdf_bsdf))
             ch->kind = CHOICE_DELTA;
@@ -635,6 +660,10 @@ static inline void choose(tr_worker *w, int id, choice *ch)
     if (k < 0)
         return;
     if (w->alpha[k] < 1) {
+        if (resamples(w, id)) {
+            ch->kind = CHOICE_RESAMPLED;
+            return;
+        }
         float choose_u = rng_float(&p->guide_rng);
         w->sample_u[k][0] = rng_float(&p->guide_rng);
         w->sample_u[k][1] = rng_float(&p->guide_rng);
@@ -647,28 +676,118 @@ static inline void choose(tr_worker *w, int id, choice *ch)
         ch->kind = CHOICE_BSDF;
 }
 
+/* Directions of the method for the first n entries of w->index: wi and pdf_guide, by k. */
+static void query_sample(tr_worker *w, const tr_frame *frame, int n)
+{
+    if (n == 0)
+        return;
+    double start = tr_wall_seconds();
+    frame->method->sample(frame->method_data, n, w->index, w->handles, (const float(*)[2])w->sample_u, w->wi,
+                          w->pdf_guide);
+    w->counters.query += tr_wall_seconds() - start;
+}
+
+/* What the bsdf says of the direction that the method drew at place k. */
+static void complete_guided(tr_worker *w, int k, choice *ch)
+{
+    ch->wi = w->wi[k];
+    ch->f = w->pdf_guide[k] > 0 ? tr_closure_eval(&w->closures[w->smooth[k]], ch->wi, &ch->pdf_bsdf) : v3s(0);
+}
+
+/* Candidate j of each vertex that resamples: of n, alpha n come from the bsdf, with no more chance than it takes. */
+static void draw_candidates(tr_worker *w, const tr_frame *frame, int j)
+{
+    int n = frame->candidates, guided = 0, asked = 0;
+    for (int i = 0; i < w->several_count; ++i) {
+        int k = w->several[i], id = w->smooth[k];
+        tr_rng *rng = &w->paths[id].guide_rng;
+        candidate *c = &w->candidates[i * n + j];
+        float u0 = rng_float(rng), u1, u2;
+        rng_float2(rng, &u1, &u2);
+        memset(c, 0, sizeof *c);
+        if (u0 >= w->alpha[k] * (float)n - (float)j) {
+            c->choice.kind = CHOICE_GUIDE;
+            w->sample_u[k][0] = u1;
+            w->sample_u[k][1] = u2;
+            w->index[guided++] = k;
+        } else if (tr_closure_sample(&w->closures[id], rng_float(rng), u1, u2, &c->choice.wi, &c->choice.f,
+                                     &c->choice.pdf_bsdf)) {
+            c->choice.kind = CHOICE_BSDF;
+        }
+    }
+    query_sample(w, frame, guided);
+    for (int i = 0; i < w->several_count; ++i) {
+        int k = w->several[i];
+        candidate *c = &w->candidates[i * n + j];
+        if (c->choice.kind == CHOICE_GUIDE) {
+            complete_guided(w, k, &c->choice);
+            c->pdf_guide = w->pdf_guide[k];
+        } else if (c->choice.kind == CHOICE_BSDF) {
+            w->wi[k] = c->choice.wi;
+            w->index[asked++] = k;
+        }
+    }
+    query_pdf(w, frame, asked);
+    for (int i = 0; i < w->several_count; ++i) {
+        candidate *c = &w->candidates[i * n + j];
+        if (c->choice.kind == CHOICE_BSDF)
+            c->pdf_guide = w->pdf_guide[w->several[i]];
+    }
+}
+
+/* Resampled importance sampling (Talbot et al. 2005): the method chooses a candidate. Where it takes none, one of them
+   stays to be recorded, as refused. */
+static void choose_candidate(tr_worker *w, const tr_frame *frame, int k, const candidate *c, choice *ch)
+{
+    int id = w->smooth[k], n = frame->candidates, at;
+    const void *handle = (const char *)w->handles + (size_t)k * frame->method->handle_size;
+    tr_candidate offers[TR_MAX_CANDIDATES];
+    float pdf;
+    for (int j = 0; j < n; ++j) {
+        float cosine = fabsf(dot3(w->closures[id].frame.n, c[j].choice.wi)), f = mean3(c[j].choice.f);
+        offers[j] = (tr_candidate){c[j].choice.pdf_bsdf, c[j].pdf_guide, f, cosine};
+    }
+    at = frame->method->resample(frame->method_data, handle, offers, n, w->alpha[k], rng_float(&w->paths[id].guide_rng),
+                                 &pdf);
+    ch->kind = CHOICE_NONE;
+    for (int j = 0; at == n && j < n && ch->kind == CHOICE_NONE; ++j) {
+        *ch = c[j].choice;
+        ch->f = v3s(0);
+        w->pdf_guide[k] = c[j].pdf_guide;
+    }
+    if (at == n)
+        return;
+    *ch = c[at].choice;
+    ch->pdf = pdf;
+    w->pdf_guide[k] = c[at].pdf_guide;
+}
+
+static void choose_among_several(tr_worker *w, const tr_frame *frame, choice *choices)
+{
+    for (int j = 0; j < frame->candidates; ++j)
+        draw_candidates(w, frame, j);
+    for (int i = 0; i < w->several_count; ++i) {
+        int k = w->several[i];
+        choose_candidate(w, frame, k, &w->candidates[i * frame->candidates], &choices[w->smooth[k]]);
+    }
+}
+
 /* Make all choices and complete the guided ones (f and bsdf pdf) and the guide's pdf of bsdf choices. */
 static void choose_guided(tr_worker *w, const tr_frame *frame, choice *choices)
 {
     int guided = 0, asked = 0;
+    w->several_count = 0;
     for (int i = 0; i < w->active_count; ++i) {
         int id = w->active[i];
         choose(w, id, &choices[id]);
         if (choices[id].kind == CHOICE_GUIDE)
             w->index[guided++] = w->place[id];
+        else if (choices[id].kind == CHOICE_RESAMPLED)
+            w->several[w->several_count++] = w->place[id];
     }
-    if (guided) {
-        double start = tr_wall_seconds();
-        frame->method->sample(frame->method_data, guided, w->index, w->handles, (const float(*)[2])w->sample_u, w->wi,
-                              w->pdf_guide);
-        w->counters.query += tr_wall_seconds() - start;
-        for (int i = 0; i < guided; ++i) {
-            int k = w->index[i], id = w->smooth[k];
-            choice *ch = &choices[id];
-            ch->wi = w->wi[k];
-            ch->f = w->pdf_guide[k] > 0 ? tr_closure_eval(&w->closures[id], ch->wi, &ch->pdf_bsdf) : v3s(0);
-        }
-    }
+    query_sample(w, frame, guided);
+    for (int i = 0; i < guided; ++i)
+        complete_guided(w, w->index[i], &choices[w->smooth[w->index[i]]]);
     for (int i = 0; i < w->active_count; ++i) {
         int id = w->active[i], k = w->place[id];
         if (choices[id].kind == CHOICE_BSDF && w->alpha[k] < 1) {
@@ -677,6 +796,8 @@ static void choose_guided(tr_worker *w, const tr_frame *frame, choice *choices)
         }
     }
     query_pdf(w, frame, asked);
+    if (w->several_count)
+        choose_among_several(w, frame, choices);
 }
 
 static void fill_vertex(tr_worker *w, const tr_frame *frame, int id, const choice *ch, float cosine, float pdf_mix,
@@ -734,11 +855,12 @@ static inline bool follow(tr_worker *w, const tr_frame *frame, int id, const cho
         int k = w->place[id];
         pdf = mixture(c, w->alpha[k], ch->pdf_bsdf, w->pdf_guide[k]);
         float cosine = fabsf(dot3(c->frame.n, ch->wi));
+        float divisor = ch->pdf > 0 ? (1 - c->delta_probability) * ch->pdf : pdf;
         if (!(pdf > 0))
             return false;
-        weight = scale3(ch->f, p->roulette * cosine / pdf);
+        weight = scale3(ch->f, p->roulette * cosine / divisor);
         if (recording)
-            fill_vertex(w, frame, id, ch, cosine, pdf, scale3(p->throughput, p->roulette));
+            fill_vertex(w, frame, id, ch, cosine, divisor, scale3(p->throughput, p->roulette));
     }
     if (!finite3(weight) || max3(weight) <= 0)
         return false;

@@ -68,6 +68,7 @@ typedef struct tr_frame {
     uint64_t first_sample; /* index of the round's first sample per pixel, over the whole render */
     int samples;           /* samples per pixel to take now */
     bool record;
+    int candidates;           /* directions that a guided vertex chooses from, 1 .. TR_MAX_CANDIDATES */
     bool guiding;             /* some vertex may be guided: ask the method */
     bool describe;            /* fill the cell and depth layers from this round's first sample */
     const tr_image *estimate; /* pixel estimate for the records' weights, or NULL */

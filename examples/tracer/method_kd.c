@@ -6,9 +6,10 @@
    are surely like their cell go), rest=on|off (mixtures that no longer change are not fitted), max_levels, max_lobes,
    update_samples, max_memory_mb, learn_alpha=grid|off (on = grid), alpha, gate=on|off, gate_margin, gate_gain,
    gate_probe, uniform, simd=scalar|avx2|avx512|neon, product=on|off (with the cosine), parallax=on|off (lobes know
-   distances), jitter=on|off (find looks up a jittered position), sparse=on|off (closed fields record only some tiles),
-   time_structure=on|off (a second field without mixtures learns from the same samples: its CPU seconds are the price of
-   the tree and its signatures, sorting of the samples included). */
+   distances), jitter=on|off (find looks up a jittered position), sampling=mis|ris (where the bsdf is not diffuse: one
+   direction, or one of candidates=2 chosen by what the product of bsdf and guide is there), sparse=on|off (closed
+   fields record only some tiles), time_structure=on|off (a second field without mixtures learns from the same samples:
+   its CPU seconds are the price of the tree and its signatures, sorting of the samples included). */
 #include "method_options.h"
 #include "threads.h"
 
@@ -23,6 +24,7 @@ typedef struct kd {
     gkd_stream **streams;
     int tiles;
     bool product, jitter, sparse, parallax, time_structure;
+    int candidates;
     float fraction; /* of the tiles that record in this pass */
     int pass;
     uint64_t stream_peak;
@@ -67,6 +69,9 @@ static bool parse(parser *p, gkd_desc *d, kd *m)
     m->jitter = choice(p, "jitter", "off|on") == 1;
     m->sparse = choice(p, "sparse", "off|on") != 0;
     m->time_structure = choice(p, "time_structure", "off|on") == 1;
+    m->candidates = choice(p, "sampling", "mis|ris") == 1 ? (int)whole(p, "candidates", 2) : 1;
+    if (m->candidates < 1 || m->candidates > TR_MAX_CANDIDATES)
+        complain(p, "candidates", option(p->env, "candidates"), "1 .. 8");
     return p->ok;
 }
 
@@ -256,6 +261,24 @@ static void kd_reflected(void *method, int n, const void *handles, float *radian
         radiance[i] = h[i].reflected;
 }
 
+static int kd_candidates(void *method) { return ((const kd *)method)->candidates; }
+
+static int kd_resample(void *method, const void *handle, const tr_candidate *candidates, int n, float alpha, float u,
+                       float *pdf)
+{
+    const kd *m = method;
+    const bool cosine = m->product && ((const gkd_handle *)handle)->surface; /* the guide's density holds it */
+    gkd_candidate c[TR_MAX_CANDIDATES];
+    for (int i = 0; i < n; ++i) {
+        const tr_candidate *t = &candidates[i];
+        c[i].pdf_bsdf = t->pdf_bsdf;
+        c[i].pdf_guide = t->pdf_guide;
+        c[i].f = cosine ? t->f : t->f * t->cosine;
+        c[i].cosine = cosine ? t->cosine : 1;
+    }
+    return (int)gkd_resample(c, (uint32_t)n, alpha, u, pdf);
+}
+
 /* ---- reports */
 
 /* Cell number, and the lobes of its mixture. */
@@ -313,6 +336,8 @@ const tr_method tr_method_kd = {.name = "kd",
                                 .find = kd_find,
                                 .sample = kd_sample,
                                 .pdf = kd_pdf,
+                                .candidates = kd_candidates,
+                                .resample = kd_resample,
                                 .copy_handle = kd_copy_handle,
                                 .reflected = kd_reflected,
                                 .record = kd_record,

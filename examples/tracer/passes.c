@@ -622,9 +622,11 @@ static bool create_method(render_state *r, char *err, size_t err_size)
                          .parallel_user = r->pool,
                          .options = s->options,
                          .option_count = s->option_count};
-    r->frame.method_data = s->method->create(&env, err, err_size);
+    const tr_method *m = s->method;
+    r->frame.method_data = m->create(&env, err, err_size);
     if (!r->frame.method_data)
         return fail(err, err_size, "the method could not start: out of memory");
+    r->frame.candidates = m->candidates && m->resample ? m->candidates(r->frame.method_data) : 1;
     for (int i = 0; i < s->option_count; ++i)
         if (!s->options[i].used) {
             snprintf(err, err_size, "--set %s: method '%s' has no such option", s->options[i].key, s->method->name);

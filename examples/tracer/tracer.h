@@ -442,8 +442,9 @@ typedef struct tr_vertex {
     vec3 f;           /* smooth bsdf, without cosine */
     float cosine;     /* |dot(ns, wi)| */
     float roughness;
-    float pdf_mix, pdf_bsdf, pdf_guide; /* per steradian; pdf_mix = alpha pdf_bsdf + (1 - alpha) pdf_guide. All three
-                                           hold the probability of taking the smooth part; pdf_guide 0 = not asked */
+    float pdf_mix, pdf_bsdf, pdf_guide; /* per steradian; pdf_mix = alpha pdf_bsdf + (1 - alpha) pdf_guide, or what
+                                           resampling divides by instead. All three hold the probability of taking the
+                                           smooth part; pdf_guide 0 = not asked */
     float alpha;                        /* probability of bsdf sampling used here */
     vec3 pixel_weight;                  /* throughput before this vertex (all pdfs and roulette in) / pixel estimate */
     float u;                            /* time or wavelength feature in [0, 1) */
@@ -547,6 +548,13 @@ typedef struct tr_lookup {
     const float (*u)[3]; /* random numbers in [0,1)^3 for stochastic lookup */
 } tr_lookup;
 
+/* One of several directions between which a method chooses. */
+typedef struct tr_candidate {
+    float pdf_bsdf, pdf_guide; /* per steradian */
+    float f, cosine;           /* mean over channels of the smooth bsdf; 0 = no direction could be drawn */
+} tr_candidate;
+#define TR_MAX_CANDIDATES 8
+
 typedef struct tr_method_stats {
     uint64_t samples, refused, cells, bytes;
     double extra_bytes; /* streams and scratch at their peak */
@@ -573,6 +581,12 @@ typedef struct tr_method {
                    float *pdf);
     /* Density of wi[index[i]] under handles[index[i]], to pdf[index[i]]. */
     void (*pdf)(void *method, int n, const int *index, const void *handles, const vec3 *wi, float *pdf);
+    /* Resampling: directions to draw at each guided vertex that is not diffuse, alpha of them from the bsdf; NULL: one,
+       which is one-sample MIS. resample chooses among n = candidates(): the index and in *pdf what to divide by, n
+       where none can be taken. */
+    int (*candidates)(void *method);
+    int (*resample)(void *method, const void *handle, const tr_candidate *candidates, int n, float alpha, float u,
+                    float *pdf);
     /* Make `to` as good as `from`, which find filled, until find fills it again; NULL = a copy of its bytes is. */
     void (*copy_handle)(void *to, const void *from);
     /* Mean radiance that the surface at each handle's vertex reflects, to radiance[i]; 0 = not known yet. */
