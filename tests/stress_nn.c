@@ -827,8 +827,9 @@ static void failing_allocator(stress *s)
         stress_memory memory = {0};
         gnn_unet_desc own = d;
         gnn_unet *other = NULL;
-        long before = 0;
-        bool good = true;
+        void *planted = NULL;
+        long before;
+        bool good;
         own.allocate = stress_allocate;
         own.release = stress_release;
         own.user = &memory;
@@ -837,7 +838,7 @@ static void failing_allocator(stress *s)
         STRESS_CHECK(s, good == (other != NULL) && good == (memory.failed == 0), "create with %ld failures",
                      memory.failed);
         if (other && s->sabotage && stress_chance(s, 0.3))
-            s->deviating = true, stress_allocate(&memory, 8);
+            s->deviating = true, planted = stress_allocate(&memory, 8);
         for (int i = 0; other && i < 2; ++i) {
             gnn_result result;
             before = memory.failed;
@@ -860,6 +861,7 @@ static void failing_allocator(stress *s)
         STRESS_CHECK(s, memory.live == (other ? 2 : 0), "%ld pieces of memory are held", memory.live);
         gnn_unet_destroy(other);
         STRESS_CHECK(s, memory.live == 0, "%ld leaks", memory.live);
+        stress_release(&memory, planted);
         stress_end(s, memory.failed > 0);
     }
     gnn_unet_destroy(net);
