@@ -83,8 +83,10 @@
 
    NUMERICAL LIMITS
      Winograd's method differs from the definition by <= 5e-5 of a convolution's output rms, the direct kernel by <=
-   1e-5; levels of SIMD from each other by as much, a network's output by <= 1e-4; so trained weights differ between
-   levels. Within a level all is bit-identical.
+     1e-5; levels of SIMD from each other by as much, a network's output by <= 1e-4; so trained weights differ between
+     levels. Within a level all is bit-identical.
+     NEON: the tests of convolutions against double precision and of the network against the scalar level have run in
+     an emulator of AArch64 (tests/compile-matrix.sh, where there is one); its speed has not been measured.
 
    REFERENCES
      S. Zhu, Z. Xu, T. Sun, A. Kuznetsov, M. Meyer, H. Jensen, H. Su, R. Ramamoorthi 2021, Photon-Driven Neural
