@@ -14,7 +14,8 @@
 #
 #   config=release|debug|scalar|sanitize|tsan|coverage    each has its own folder (build/, build-debug/, ...)
 #   CC=clang  V=1  WERROR=1  NO_INSTALL=1  TESTS="sdtree bsdf"  GUIDE_SCENES=folder with downloaded scenes
-#   OPENPGL_DIR=installation of Intel Open PGL: builds the renderer's method openpgl   DEMO_SECONDS=40  DEMO_SIZE=320x180
+#   OPENPGL_DIR=installation of Intel Open PGL: builds the renderer's method openpgl
+#   DNNL_DIR=installation of oneDNN 2 (else the system's, if any): bench_nn compares with it   DEMO_SECONDS=40  DEMO_SIZE=320x180
 
 config ?= release
 DEMO_SECONDS ?= 40
@@ -49,10 +50,14 @@ B := build$(if $(filter-out release,$(config)),-$(config))
 PREFIX_INC := $(if $(wildcard /opt/homebrew/include),-I/opt/homebrew/include)
 PREFIX_LIB := $(if $(wildcard /opt/homebrew/lib),-L/opt/homebrew/lib)
 
-# Embree 4 where its header is found, else Embree 3 (examples/tracer/embree.h chooses alike).
+# Embree 4 where its header is found, else Embree 3 (examples/tracer/embree.h chooses alike). oneDNN, a peer of bench_nn
+# only, where version 2 is found.
+DNNL_INC := $(if $(DNNL_DIR),-isystem $(abspath $(DNNL_DIR))/include)
 ifneq ($(filter-out clean format lint deps help,$(or $(MAKECMDGOALS),all)),)
-EMBREE := $(shell printf '\043if __has_include(<embree4/rtcore.h>)\nembree4\n\043else\nembree3\n\043endif\n' | \
-	$(CC) $(PREFIX_INC) -E -P - 2>/dev/null | grep -o 'embree[34]')
+FOUND := $(shell printf '\043if __has_include(<embree4/rtcore.h>)\nembree4\n\043else\nembree3\n\043endif\n\
+	\043if __has_include(<oneapi/dnnl/dnnl_version.h>)\n\043include <oneapi/dnnl/dnnl_version.h>\n\
+	\043if DNNL_VERSION_MAJOR == 2\nonednn\n\043endif\n\043endif\n' | $(CC) $(PREFIX_INC) $(DNNL_INC) -E -P - 2>/dev/null)
+EMBREE := $(filter embree%,$(FOUND))
 endif
 
 WARN := -Wall -Wextra -Wshadow -Wstrict-prototypes $(if $(WERROR),-Werror)
@@ -62,6 +67,11 @@ TRACER_FLAGS := -fno-math-errno -fno-trapping-math
 CPPFLAGS_ALL = -D_POSIX_C_SOURCE=200809L -I. -Iexamples/tracer $(PREFIX_INC) $(CPPFLAGS)
 LDFLAGS_ALL = $(filter -fsanitize% --coverage,$($(config)_FLAGS)) -pthread $(PREFIX_LIB) $(LDFLAGS)
 LIBS := -l$(or $(EMBREE),embree3) -lOpenEXRCore -lexpat -lassimp -lz -lm -lpthread
+
+ifneq ($(filter onednn,$(FOUND)),)
+CPPFLAGS_ALL += -DBENCH_DNNL $(DNNL_INC)
+PEER_LIBS = $(if $(DNNL_DIR),$(foreach d,$(wildcard $(DNNL_DIR)/lib $(DNNL_DIR)/lib64),-L$d -Wl$(comma)-rpath$(comma)$(abspath $d))) -ldnnl
+endif
 
 # Intel Open PGL is optional: one C++ file adapts it, and what is linked needs the C++ library then.
 ifneq ($(OPENPGL_DIR),)
@@ -174,7 +184,7 @@ $(B)/bench_field: $(if $(OPENPGL_DIR),$(B)/obj/bench/field_openpgl.o)
 
 $(BENCHES) $(BENCH_TOOLS): $(B)/%: $(B)/obj/bench/%.o $(B)/libtracer.a
 	$(SAY) LD $@
-	$(LINK) $(LIBS) -o $@
+	$(LINK) $(LIBS) $(if $(filter %/bench_nn,$@),$(PEER_LIBS)) -o $@
 
 .SECONDARY:
 -include $(wildcard $(B)/obj/*/*.d $(B)/obj/*.d)

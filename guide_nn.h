@@ -83,8 +83,10 @@
 
    NUMERICAL LIMITS
      Winograd's method differs from the definition by <= 5e-5 of a convolution's output rms, the direct kernel by <=
-   1e-5; levels of SIMD from each other by as much, a network's output by <= 1e-4; so trained weights differ between
-   levels. Within a level all is bit-identical.
+     1e-5; levels of SIMD from each other by as much, a network's output by <= 1e-4; so trained weights differ between
+     levels. Within a level all is bit-identical.
+     NEON: the tests of convolutions against double precision and of the network against the scalar level have run in
+     an emulator of AArch64 (tests/compile-matrix.sh, where there is one); its speed has not been measured.
 
    REFERENCES
      S. Zhu, Z. Xu, T. Sun, A. Kuznetsov, M. Meyer, H. Jensen, H. Su, R. Ramamoorthi 2021, Photon-Driven Neural
@@ -942,16 +944,21 @@ typedef struct gnni_finish {
         o[3] = GNNI_##L##_ADD(GNNI_##L##_FMA(GNNI_##L##_SET(8), v, d), m[5]);                                          \
     } while (0)
 
-/* Channels of one vector of one tile: pixel (i, j) of the 6x6 stands at rows[i] + columns[j]. */
+/* Where the pixels of a tile of 6x6 stand: (i, j) at rows[i] + columns[j] floats from the tile's first. */
+typedef struct gnni_offsets {
+    size_t rows[6], columns[6];
+} gnni_offsets;
+
+/* Channels of one vector of one tile. */
 #define GNNI_WINOGRAD(L)                                                                                               \
-    GNNI_##L##_TARGET static void gnni_winograd_in_##L(const float *const *rows, const size_t *columns, float *v,      \
+    GNNI_##L##_TARGET static void gnni_winograd_in_##L(const float *tile, const gnni_offsets *at, float *v,            \
                                                        size_t plane)                                                   \
     {                                                                                                                  \
         GNNI_##L##_V half[6][6], d[6], t[6];                                                                           \
         int i, j;                                                                                                      \
         GNNI_UNROLL for (j = 0; j < 6; ++j)                                                                            \
         {                                                                                                              \
-            GNNI_UNROLL for (i = 0; i < 6; ++i) d[i] = GNNI_##L##_LOAD(rows[i] + columns[j]);                          \
+            GNNI_UNROLL for (i = 0; i < 6; ++i) d[i] = GNNI_##L##_LOAD(tile + at->rows[i] + at->columns[j]);           \
             GNNI_INPUT_6(L, d, t);                                                                                     \
             GNNI_UNROLL for (i = 0; i < 6; ++i) half[i][j] = t[i];                                                     \
         }                                                                                                              \
@@ -1002,29 +1009,26 @@ GNNI_WINOGRAD(AVX512)
 GNNI_WINOGRAD(NEON)
 #endif
 
-static void gnni_winograd_in(gnn_simd simd, const float *const *rows, const size_t *columns, uint32_t channels,
-                             float *v, size_t plane)
+static void gnni_winograd_in(gnn_simd simd, const float *tile, const gnni_offsets *at, uint32_t channels, float *v,
+                             size_t plane)
 {
-    const float *r[6];
-    uint32_t c = 0, k, step;
+    uint32_t c = 0, step;
     for (; c < channels; c += step) {
-        for (k = 0; k < 6; ++k)
-            r[k] = rows[k] + c;
         step = 8;
 #if GNNI_X86
         if (simd == GNN_SIMD_AVX512 && c + 16 <= channels) {
-            gnni_winograd_in_AVX512(r, columns, v + c, plane);
+            gnni_winograd_in_AVX512(tile + c, at, v + c, plane);
             step = 16;
         } else if (simd == GNN_SIMD_AVX2 || simd == GNN_SIMD_AVX512) {
-            gnni_winograd_in_AVX2(r, columns, v + c, plane);
+            gnni_winograd_in_AVX2(tile + c, at, v + c, plane);
         } else
 #elif GNNI_NEON
         if (simd == GNN_SIMD_NEON) {
-            gnni_winograd_in_NEON(r, columns, v + c, plane);
+            gnni_winograd_in_NEON(tile + c, at, v + c, plane);
             step = 4;
         } else
 #endif
-            gnni_winograd_in_SCALAR(r, columns, v + c, plane);
+            gnni_winograd_in_SCALAR(tile + c, at, v + c, plane);
     }
     (void)simd;
 }
@@ -1052,27 +1056,34 @@ static void gnni_winograd_out(gnn_simd simd, const gnni_finish *f, uint32_t colu
     (void)simd;
 }
 
-/* The transformed inputs of tile (x, y); v is the tile's first float in plane 0. */
-static void gnni_winograd_tile_in(const gnn_conv *c, const gnn_conv_maps *m, uint32_t x, uint32_t y, float *v,
-                                  size_t plane)
+/* Pixel p of the upsampled map is pixel p >> 1 of the small one; tiles begin at odd pixels. */
+static gnni_offsets gnni_winograd_offsets(uint32_t width, uint32_t stride, bool up)
 {
-    const float *rows[6];
-    size_t columns[6];
-    int64_t k;
-    if (c->up) { /* pixel p of the upsampled map is pixel p >> 1 of the small one; counted from the halo to stay >= 0 */
-        for (k = 0; k < 6; ++k) {
-            rows[k] = m->up + gnni_at(c->width / 2, c->up_stride, -1, (4 * (int64_t)y + k + 1) / 2 - 1);
-            columns[k] = (size_t)((4 * (int64_t)x + k + 1) / 2) * c->up_stride;
-        }
-        gnni_winograd_in(c->simd, rows, columns, c->up_stride, v, plane);
-        v += c->up_stride;
+    gnni_offsets at;
+    size_t k;
+    for (k = 0; k < 6; ++k) {
+        at.columns[k] = (up ? (k + 1) / 2 : k) * stride;
+        at.rows[k] = at.columns[k] * ((up ? width / 2 : width) + 2);
     }
-    if (c->in) {
-        for (k = 0; k < 6; ++k) {
-            rows[k] = m->in + gnni_at(c->width, c->in_stride, -1, 4 * (int64_t)y + k - 1);
-            columns[k] = (size_t)(4 * (int64_t)x + k) * c->in_stride;
-        }
-        gnni_winograd_in(c->simd, rows, columns, c->in_stride, v, plane);
+    return at;
+}
+
+/* The transformed inputs of tiles [first, first + tiles); v[36][plane]. */
+static void gnni_winograd_tiles_in(const gnn_conv *c, const gnn_conv_maps *m, uint32_t first, uint32_t tiles, float *v)
+{
+    gnni_offsets up = gnni_winograd_offsets(c->width, c->up_stride, true);
+    gnni_offsets in = gnni_winograd_offsets(c->width, c->in_stride, false);
+    uint32_t across = c->width / 4, channels = gnni_channels(c), x = first % across, y = first / across, t;
+    size_t plane = gnni_plane(channels);
+    for (t = 0; t < tiles; ++t, v += channels) {
+        if (c->up)
+            gnni_winograd_in(c->simd, m->up + (size_t)(2 * y * (c->width / 2 + 2) + 2 * x) * c->up_stride, &up,
+                             c->up_stride, v, plane);
+        if (c->in)
+            gnni_winograd_in(c->simd, m->in + (size_t)(4 * y * (c->width + 2) + 4 * x) * c->in_stride, &in,
+                             c->in_stride, v + (c->up ? c->up_stride : 0), plane);
+        if (++x == across)
+            x = 0, ++y;
     }
 }
 
@@ -1108,9 +1119,7 @@ static void gnni_winograd_forward(const gnn_conv *c, const float *bias, const fl
     f.bias = bias;
     for (first = 0; first < count; first += GNNI_TILES) {
         uint32_t tiles = count - first < GNNI_TILES ? count - first : GNNI_TILES;
-        for (t = 0; t < tiles; ++t)
-            gnni_winograd_tile_in(c, maps, (first + t) % across, (first + t) / across, v + (size_t)t * channels,
-                                  gnni_plane(channels));
+        gnni_winograd_tiles_in(c, maps, first, tiles, v);
         gnni_winograd_multiply(c, u, v, m, tiles);
         for (t = 0; t < tiles; ++t) {
             uint32_t x = 4 * ((first + t) % across), y = 4 * ((first + t) / across);
@@ -2116,30 +2125,52 @@ GNN_API gnn_result gnn_tensors_write(const gnn_weight *weights, uint32_t count, 
 
 /* ---- >>parts ------------------------------------------------------------------------------------------------ */
 
+/* Three rows of masks one above the other; a turned one begins at phi + pi. */
+typedef struct gnni_mask_rows {
+    const float *row[3];
+    uint32_t turn[3];
+} gnni_mask_rows;
+
+/* Valid pixels of column x of the three. */
+static float gnni_mask_column(const gnni_mask_rows *m, uint32_t width, uint32_t x)
+{
+    return m->row[0][(x + m->turn[0]) % width] + m->row[1][x] + m->row[2][(x + m->turn[2]) % width];
+}
+
+/* n <= 64 pixels of a row of the result, from pixel `begin` on; neither of the three rows wraps among them. */
+static void gnni_mask_piece(const gnni_mask_rows *m, uint32_t width, uint32_t begin, uint32_t n, float *scale)
+{
+    const float *a = m->row[0] + (begin + m->turn[0]) % width, *b = m->row[1] + begin;
+    const float *c = m->row[2] + (begin + m->turn[2]) % width;
+    float columns[66];
+    uint32_t i;
+    columns[0] = gnni_mask_column(m, width, begin ? begin - 1 : width - 1);
+    columns[n + 1] = gnni_mask_column(m, width, begin + n < width ? begin + n : 0);
+    for (i = 0; i < n; ++i)
+        columns[i + 1] = a[i] + b[i] + c[i];
+    for (i = 0; i < n; ++i) {
+        float count = columns[i] + columns[i + 1] + columns[i + 2];
+        scale[i] = 9 / (count > 0 ? count : INFINITY); /* no branch: compilers make vectors of it */
+    }
+}
+
 GNN_API void gnn_mask_grow(const float *mask, uint32_t width, uint32_t height, float *scale, float *grown)
 {
-    uint32_t x, y, k;
-    for (y = 0; y < height; ++y) {
-        const float *row[3];
-        uint32_t turn[3];
+    uint32_t x, y, k, n, half = width - width / 2;
+    for (y = 0; y < height; ++y, scale += width) {
+        gnni_mask_rows m;
         for (k = 0; k < 3; ++k) { /* rows y - 1, y, y + 1; turned by half beyond a pole */
             int64_t at = (int64_t)(y + k) - 1;
-            turn[k] = at < 0 || at >= height ? width / 2 : 0;
-            row[k] = mask + (size_t)(at < 0 ? 0 : at >= height ? height - 1 : at) * width;
+            m.turn[k] = at < 0 || at >= height ? width / 2 : 0;
+            m.row[k] = mask + (size_t)(at < 0 ? 0 : at >= height ? height - 1 : at) * width;
         }
-        for (x = 0; x < width; ++x) {
-            float count = 0;
-            for (k = 0; k < 3; ++k) {
-                uint32_t middle = x + turn[k], left, right;
-                middle = middle >= width ? middle - width : middle;
-                left = middle ? middle - 1 : width - 1;
-                right = middle + 1 < width ? middle + 1 : 0;
-                count += row[k][left] + row[k][middle] + row[k][right];
-            }
-            scale[(size_t)y * width + x] = count > 0 ? 9 / count : 0;
-            if (grown)
-                grown[(size_t)y * width + x] = count > 0 ? 1.0f : 0.0f;
+        for (x = 0; x < width; x += n) {
+            n = (x < half ? half : width) - x;
+            n = n < 64 ? n : 64;
+            gnni_mask_piece(&m, width, x, n, scale + x);
         }
+        for (x = 0; grown && x < width; ++x)
+            grown[(size_t)y * width + x] = scale[x] > 0 ? 1.0f : 0.0f;
     }
 }
 
@@ -2663,16 +2694,18 @@ static void gnni_take_input(const gnni_map *m, const float *planes)
     size_t area = (size_t)d->width * d->height, i;
     const float *b = planes + (d->inputs - 1) * area;
     float *map = m->w + m->at->input, *mask = m->w + m->at->mask;
-    uint32_t x, y, c, stride = gnn_stride(d->inputs);
-    gnn_map_from_planes(planes, d->width, d->height, d->inputs, stride, map);
-    if (d->no_mask)
+    uint32_t c, stride = gnn_stride(d->inputs);
+    if (d->no_mask) {
+        gnn_map_from_planes(planes, d->width, d->height, d->inputs, stride, map);
         return;
-    for (i = 0; i < area; ++i)
+    }
+    memset(map, 0, gnn_map_floats(d->width, d->height, stride) * sizeof(float));
+    for (i = 0; i < area; ++i) {
+        float *pixel = map + (i + i / d->width * 2 + d->width + 3) * stride; /* rows are 2 longer, one is before them */
         mask[i] = b[i] > 0 ? 1.0f : 0.0f;
-    for (y = 0; y < d->height; ++y)
-        for (x = 0; x < d->width; ++x)
-            for (c = 0; c < d->inputs && mask[(size_t)y * d->width + x] == 0; ++c)
-                map[gnni_at(d->width, stride, x, y) + c] = 0;
+        for (c = 0; c < d->inputs && b[i] > 0; ++c)
+            pixel[c] = planes[c * area + i];
+    }
     gnn_map_halo(map, d->width, d->height, stride);
 }
 

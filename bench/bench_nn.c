@@ -4,13 +4,19 @@
 
    Each layer is checked against a naive reference in double precision before it is timed. Limits are the peak rate of
    fused multiply-adds that this run measures, at the width of the level: 8 floats a vector, or 16. Operations are
-   counted as the definition has them (2 for each weight and pixel), so that a kernel that needs fewer can lie above. */
+   counted as the definition has them (2 for each weight and pixel), so that a kernel that needs fewer can lie above.
+   Where oneDNN 2 is there (Debian: libdnnl-dev, or DNNL_DIR names it) its times for the benchmark network stand beside
+   ours, and the goal is 0.7 of its better one. */
 #define GNN_IMPLEMENTATION
 #include "guide_nn.h"
 
 #include "bench.h"
 
 #include "../tests/nn_naive.h"
+
+#ifdef BENCH_DNNL
+#include "peer_dnnl.h"
+#endif
 
 static int repeats = 40;
 static FILE *json_file;
@@ -232,8 +238,8 @@ static void bench_layer(const shape *s)
 
 /* ---- networks ----------------------------------------------------------------------------------------------- */
 
-/* target in ms a map, 0 = none. */
-static void bench_net(const char *name, const uint32_t *channels, uint32_t levels, double target)
+/* target in ms a map, 0 = none. Returns the ns of a map. */
+static double bench_net(const char *name, const uint32_t *channels, uint32_t levels, double target)
 {
     enum { MAPS = 8 };
     gnn_unet_desc d;
@@ -259,6 +265,7 @@ static void bench_net(const char *name, const uint32_t *channels, uint32_t level
         bench_use(outputs);
     });
     row(text, t, gnn_unet_operations(net), 0, target);
+    double forward = t.min;
     BENCH_TIME(t, repeats / 4 + 1, MAPS, {
         check(gnn_unet_train(net, inputs, outputs, MAPS, &step, workspace, size, NULL, NULL), "train");
         bench_use(&step);
@@ -266,6 +273,57 @@ static void bench_net(const char *name, const uint32_t *channels, uint32_t level
     row("  a step of training, per map of 8", t, 3 * gnn_unet_operations(net), 0, 0);
     free(inputs), free(outputs), free(workspace);
     gnn_unet_destroy(net);
+    return forward;
+}
+
+/* The same network by oneDNN: the ns of the better of its two ways; 0 = not built. */
+static double bench_peer(const uint32_t *channels, int levels, double operations)
+{
+    double best = 0;
+#ifdef BENCH_DNNL
+    for (int winograd = 0; winograd < 2; ++winograd) {
+        static peer p;
+        bench_time t;
+        char name[80];
+        peer_create(&p, 64, 32, 5, channels, levels, winograd);
+        if (!peer_works(&p))
+            fail("oneDNN's network does not depend on its input");
+        if (winograd && !p.winograds) {
+            printf("%-44s none of the layers on this machine\n", "  oneDNN, Winograd");
+            peer_destroy(&p);
+            continue;
+        }
+        BENCH_TIME(t, repeats, 8, {
+            for (int i = 0; i < 8; ++i)
+                peer_run(&p);
+        });
+        snprintf(name, sizeof name, "  oneDNN %d.%d, direct", dnnl_version()->major, dnnl_version()->minor);
+        if (winograd)
+            snprintf(name, sizeof name, "  oneDNN, Winograd (%d layers)", p.winograds);
+        row(name, t, operations, 0, 0);
+        best = best == 0 || t.min < best ? t.min : best;
+        peer_destroy(&p);
+    }
+#else
+    (void)channels, (void)levels, (void)operations;
+    printf("%-44s not built\n", "  oneDNN");
+#endif
+    return best;
+}
+
+/* Ours between two runs of the peer, so that both see the same machine. */
+static void bench_against_peer(const uint32_t *channels)
+{
+    enum { LEVELS = 4 };
+    double theirs = bench_peer(channels, LEVELS, 168e6);
+    double ours =
+        bench_net("U-Net 5 -> 16-32-64-128 -> 1 on 32x64", channels, LEVELS, theirs > 0 ? 0.7e-6 * theirs : 0.69);
+    if (theirs == 0)
+        return;
+    double again = bench_peer(channels, LEVELS, 168e6);
+    theirs = again < theirs ? again : theirs;
+    printf("%-44s %9.2f   <= 0.70 %s\n", "  ours / oneDNN's best", ours / theirs,
+           ours <= 0.7 * theirs ? "reached" : "missed");
 }
 
 int main(int argc, char **argv)
@@ -276,6 +334,9 @@ int main(int argc, char **argv)
     static const uint32_t benchmark[] = {16, 32, 64, 128}, quarter[] = {8, 16, 32, 64}, small[] = {8, 16, 32};
     static const gnn_simd all[] = {GNN_SIMD_AVX512, GNN_SIMD_AVX2, GNN_SIMD_NEON, GNN_SIMD_SCALAR};
     static const char *const names[] = {"AVX-512", "AVX2", "NEON", "no SIMD"};
+#ifdef BENCH_DNNL
+    peer_one_thread(argv);
+#endif
     for (int i = 1; i < argc; ++i)
         if (!strcmp(argv[i], "--quick"))
             repeats = 4;
@@ -297,8 +358,10 @@ int main(int argc, char **argv)
         bool best = level == gnn_resolve_simd(GNN_SIMD_AUTO);
         for (size_t s = 0; best && s < sizeof shapes / sizeof *shapes; ++s)
             bench_layer(&shapes[s]);
-        bench_net("U-Net 5 -> 16-32-64-128 -> 1 on 32x64", benchmark, 4, best ? 0.69 : 0);
+        if (!best)
+            bench_net("U-Net 5 -> 16-32-64-128 -> 1 on 32x64", benchmark, 4, 0);
         if (best) {
+            bench_against_peer(benchmark);
             bench_net("U-Net 8-16-32-64", quarter, 4, 0.15);
             bench_net("U-Net 8-16-32 (default)", small, 3, 0.15);
         }

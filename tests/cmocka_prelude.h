@@ -7,6 +7,10 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#ifdef TEST_WITHOUT_CMOCKA
+#include "cmocka_alone.h"
+#else
 #include <cmocka.h>
+#endif
 
 #endif

@@ -150,6 +150,21 @@ else
     skip "$name (no cross compiler or no qemu-aarch64)"
 fi
 
+# NEON of guide_nn.h likewise, by some of its tests, without cmocka; on AArch64 itself all of them run it.
+emulated() { # emulated PROGRAM TESTS
+    local name="guide_nn.h: NEON passes $1 (AArch64, emulated)"
+    if command -v aarch64-linux-gnu-gcc >/dev/null && command -v qemu-aarch64 >/dev/null; then
+        aarch64-linux-gnu-gcc -std=c11 -O1 -Wall -Wextra -Wno-sign-compare -Werror -static -DTEST_WITHOUT_CMOCKA \
+            "-DTEST_ONLY=\"$2\"" -I. "tests/$1.c" -lm -lpthread -o "$tmp/$1" >"$tmp/log" 2>&1 &&
+            qemu-aarch64 "$tmp/$1" >"$tmp/log" 2>&1 && [ "$(grep -c ^ok "$tmp/log")" -eq "$(echo "$2" | wc -w)" ]
+        report $? "$name"
+    else
+        skip "$name (no cross compiler or no qemu-aarch64)"
+    fi
+}
+emulated test_nn_conv 'convolution_is_its_definition_on_every_level not_a_number_reaches_its_neighbours_only'
+emulated test_nn_histogram 'levels_of_simd_agree bad_values_stay_in_their_map'
+
 # The compile lines on top of the examples, run as they stand in a copy of the tree's root.
 mkdir -p "$tmp/root/examples/tracer"
 cp guide_*.h "$tmp/root"

@@ -91,7 +91,7 @@ static float hostile_number(stress *s)
     return some[stress_below(s, sizeof some / sizeof *some)];
 }
 
-static void unit_direction(stress *s, float d[3])
+static inline void unit_direction(stress *s, float d[3])
 {
     double z = 2 * stress_unit(s) - 1, phi = 2 * PI * stress_unit(s), r = sqrt(1 - z * z);
     d[0] = (float)(r * cos(phi));
@@ -99,7 +99,7 @@ static void unit_direction(stress *s, float d[3])
     d[2] = (float)z;
 }
 
-static void any_normal(stress *s, float n[3])
+static inline void any_normal(stress *s, float n[3])
 {
     unit_direction(s, n);
     if (stress_chance(s, 0.3))
@@ -109,7 +109,7 @@ static void any_normal(stress *s, float n[3])
 }
 
 /* Two numbers in [0, 1), often at the ends; a careless 1 too, which is clamped. */
-static void any_random(stress *s, float u[2])
+static inline void any_random(stress *s, float u[2])
 {
     const float ends[] = {0, 0x1p-149f, 0x1p-24f, 0.25f, 0.5f, 0x1.fffffep-2f, 0x1.fffffep-1f, 1};
     for (int k = 0; k < 2; ++k)
@@ -125,7 +125,7 @@ typedef struct recipe {
     float point[3], lamp[3];
 } recipe;
 
-static recipe any_recipe(stress *s, bool hostile)
+static inline recipe any_recipe(stress *s, bool hostile)
 {
     recipe r = {(int)stress_below(s, hostile ? 6 : 4),
                 (int)stress_below(s, hostile ? 5 : 3),
@@ -139,7 +139,7 @@ static recipe any_recipe(stress *s, bool hostile)
     return r;
 }
 
-static void any_position(stress *s, const recipe *r, const float low[3], const float high[3], float p[3])
+static inline void any_position(stress *s, const recipe *r, const float low[3], const float high[3], float p[3])
 {
     float t = stress_unitf(s);
     for (int k = 0; k < 3; ++k) {
@@ -164,7 +164,7 @@ static void any_position(stress *s, const recipe *r, const float low[3], const f
     }
 }
 
-static void any_direction(stress *s, const recipe *r, float d[3])
+static inline void any_direction(stress *s, const recipe *r, float d[3])
 {
     const float axes[][3] = {{1, 0, 0}, {1, -0.0f, 0}, {-1, 0, 0}, {0, 0, 1}, {0, 0, -1}, {0, 1, 0}, {1, -1e-30f, 0}};
     unit_direction(s, d);
@@ -183,7 +183,7 @@ static void any_direction(stress *s, const recipe *r, float d[3])
         memset(d, 0, 3 * sizeof *d);
 }
 
-static float any_value(stress *s, const recipe *r, const float d[3])
+static inline float any_value(stress *s, const recipe *r, const float d[3])
 {
     switch (r->value) {
     case 0:
@@ -199,7 +199,7 @@ static float any_value(stress *s, const recipe *r, const float d[3])
     }
 }
 
-static float any_pdf(stress *s, const recipe *r)
+static inline float any_pdf(stress *s, const recipe *r)
 {
     if (r->pdf == 1)
         return (float)stress_log(s, 1e-30, 1e30);
@@ -213,7 +213,7 @@ static inline float any_distance(stress *s, bool hostile)
     return stress_chance(s, 0.3) ? INFINITY : (float)stress_log(s, 1e-3, 100);
 }
 
-static bool bad_value(float x) { return !(x >= 0) || !isfinite(x) || !((double)x < 9.9e29); }
+static inline bool bad_value(float x) { return !(x >= 0) || !isfinite(x) || !((double)x < 9.9e29); }
 
 static uint32_t some(stress *s, double most) { return (uint32_t)stress_log(s, 1, most); }
 
@@ -229,7 +229,7 @@ typedef struct stress_limit {
     }
 
 /* Put one option at or beyond a limit; true where it must be refused. */
-static bool set_extreme(stress *s, void *d, const stress_limit *limits, size_t count)
+static inline bool set_extreme(stress *s, void *d, const stress_limit *limits, size_t count)
 {
     const stress_limit *l = &limits[stress_below(s, (uint32_t)count)];
     const double beyond[] = {l->low * 0.9, l->high * 1.1 + 1, -1, NAN, INFINITY, -l->high, 1e-40};
@@ -246,7 +246,7 @@ static bool set_extreme(stress *s, void *d, const stress_limit *limits, size_t c
 }
 
 /* Bounds of all sizes and places, and the largest extent; false where they must be refused. */
-static bool set_bounds(stress *s, float bounds_min[3], float bounds_max[3], double *extent)
+static inline bool set_bounds(stress *s, float bounds_min[3], float bounds_max[3], double *extent)
 {
     bool bad = false;
     *extent = 0;

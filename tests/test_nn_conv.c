@@ -427,7 +427,7 @@ static void pooling_is_the_mean_and_its_adjoint(void **state)
 
 static void masks_grow_over_the_seam_and_the_poles(void **state)
 {
-    static const int sizes[][2] = {{2, 1}, {6, 3}, {8, 1}, {10, 7}};
+    static const int sizes[][2] = {{2, 1}, {6, 3}, {8, 1}, {10, 7}, {140, 3}};
     (void)state;
     seed(9);
     for (size_t s = 0; s < sizeof sizes / sizeof *sizes; ++s)

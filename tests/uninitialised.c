@@ -1,10 +1,14 @@
-/* uninitialised.c: learns small fields with guide_kd.h, asks them, and prints a hash of all of it. Built by
-   uninitialised.sh with stack and heap filled with different bytes: the hash may not depend on them. */
+/* uninitialised.c: learns small fields with guide_kd.h, asks them, trains and runs small networks of guide_nn.h, and
+   prints a hash of all of it. Built by uninitialised.sh with stack and heap filled with different bytes: the hash may
+   not depend on them. */
 #include <stdio.h>
 #include <stdlib.h>
 
 #define GKD_IMPLEMENTATION
 #include "guide_kd.h"
+
+#define GNN_IMPLEMENTATION
+#include "guide_nn.h"
 
 #include "rng.h"
 
@@ -114,8 +118,81 @@ static bool learn(gkd_field *f, int pass)
     return good;
 }
 
+/* Maps with holes, in memory that is filled before it is written. */
+enum { MAPS = 3, WIDTH = 16, HEIGHT = 8, INPUTS = 3 };
+static float inputs[MAPS][INPUTS][HEIGHT][WIDTH], truths[MAPS][HEIGHT][WIDTH], outputs[MAPS][HEIGHT][WIDTH];
+
+static void make_maps(void)
+{
+    for (int i = 0; i < MAPS * HEIGHT * WIDTH; ++i) {
+        int m = i / (HEIGHT * WIDTH), y = i / WIDTH % HEIGHT, x = i % WIDTH;
+        bool there = rndf() < 0.3f;
+        for (int c = 0; c < INPUTS; ++c)
+            inputs[m][c][y][x] = c + 1 == INPUTS ? (float)there : there ? 1 + rndf() : 0;
+        truths[m][y][x] = 2 * rndf();
+    }
+    memset(outputs, FILL, sizeof outputs);
+}
+
+/* Saves it and loads that; the save is part of the hash. */
+static bool save_net(gnn_unet *net, gnn_type type)
+{
+    size_t bound = gnn_unet_bound(net, type, NULL), size = 0;
+    void *file = filled(NULL, bound);
+    bool good = file && !gnn_unet_save(net, type, NULL, file, bound, &size) && !gnn_unet_load(net, file, size, NULL);
+    add(file, size);
+    free(file);
+    return good;
+}
+
+static bool train_net(const gnn_unet_desc *d)
+{
+    gnn_unet *net;
+    gnn_step step;
+    size_t size;
+    void *workspace;
+    bool good = true;
+    if (gnn_unet_create(d, &net))
+        return false;
+    size = gnn_unet_workspace(net, 2, true);
+    workspace = filled(NULL, size);
+    make_maps();
+    for (int i = 0; i < 3 && good; ++i) {
+        good =
+            workspace && !gnn_unet_train(net, inputs[0][0][0], truths[0][0], MAPS, &step, workspace, size, NULL, NULL);
+        add(&step, sizeof step);
+        good = good && step.maps == MAPS && save_net(net, i == 1 ? GNN_TYPE_F16 : GNN_TYPE_F32);
+        good = good && !gnn_unet_forward(net, inputs[0][0][0], MAPS, outputs[0][0], workspace, size, NULL, NULL);
+        add(outputs, sizeof outputs);
+    }
+    free(workspace);
+    gnn_unet_destroy(net);
+    return good;
+}
+
+/* At every level of SIMD, with and without a mask; channels that fill no vector. */
+static bool train_nets(void)
+{
+    bool good = true;
+    for (int k = 0; k < 2 * (GNN_SIMD_NEON + 1) && good; ++k) {
+        gnn_unet_desc d;
+        memset(&d, 0, sizeof d);
+        d.width = WIDTH, d.height = HEIGHT, d.inputs = INPUTS;
+        d.channels[0] = 3, d.channels[1] = 9, d.channels[2] = 17;
+        d.no_mask = k % 2;
+        d.training = true;
+        d.simd = (gnn_simd)(k / 2);
+        d.allocate = filled;
+        d.release = release;
+        good = gnn_resolve_simd(d.simd) == GNN_SIMD_AUTO || train_net(&d);
+    }
+    return good;
+}
+
 int main(void)
 {
+    if (!train_nets())
+        return 2;
     for (int kind = 0; kind < 3; ++kind) {
         gkd_desc d;
         gkd_field *f;

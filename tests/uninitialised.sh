@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Does a field depend on what its memory held before? The same learning with stack and heap filled with zeros and with
+# Does a field or network depend on what its memory held before? The same learning with stack and heap filled with zeros and with
 # other bytes must give the same bits. (Address sanitizers do not look for that.) Speaks TAP.
 export LC_ALL=C
 cd "$(dirname "$0")/.." || exit 1
@@ -15,7 +15,7 @@ build() {
     ${CC:-cc} -std=c11 -O0 -ffp-contract=off -w "$@" -I. tests/uninitialised.c -o "$tmp/$name" -lm >"$log" 2>&1
 }
 
-name='a field does not depend on what memory held before'
+name='fields and networks do not depend on what memory held before'
 zero=-ftrivial-auto-var-init=zero pattern=-ftrivial-auto-var-init=pattern
 # clang before 16 wants to be asked twice for zeros.
 asked='-Xclang -enable-trivial-auto-var-init-zero-knowing-it-will-be-removed-from-clang'
