@@ -96,8 +96,8 @@
    OPTIONS: see gph_desc. gph_resolve fills in defaults, gph_get_desc returns what a field uses.
 
    MEMORY
-     n = bins (rows * rows * 2). Sampling part: 16 bytes per voxel, 3 n + 8 rows + 64 per map (1.58 times its
-     half-floats), 8 per node, 24 to 48 per cube. Building part: 336 bytes per voxel; its histogram is nothing while
+     n = bins (rows * rows * 2). Sampling part: 20 bytes per voxel, 3 n + 8 rows + 64 per map (1.58 times its
+     half-floats), 8 per node, 24 to 48 per cube. Building part: 360 bytes per voxel; its histogram is nothing while
      empty, a list of 16 bytes per lit bin below 256 photons, 12 n bytes above. The first pass's photons wait in 24
      bytes each, at most desc.cloud_photons. refine makes a new sampling part beside the old one, whose memory is kept
      for the next; from the second on each has up to a quarter to spare. max_bytes bounds all of this together: beyond
@@ -128,6 +128,7 @@
      S. Zhu, Z. Xu, T. Sun, A. Kuznetsov, M. Meyer, H. W. Jensen, H. Su, R. Ramamoorthi 2021a, Photon-Driven Neural
      Reconstruction for Path Guiding. Equations without a name are from there.
      H. W. Jensen 1995, Importance Driven Path Tracing Using the Photon Map.
+     J. Vorba, J. Krivanek 2016, Adjoint-Driven Russian Roulette and Splitting in Light Transport Simulation.
      S. Gortler, R. Grzeszczuk, R. Szeliski, M. Cohen 1996, The Lumigraph. (pull-push) */
 #ifndef GUIDE_PHOTON_H
 #define GUIDE_PHOTON_H
@@ -140,7 +141,7 @@
 #include <stdint.h>
 #include <string.h>
 
-#define GPH_VERSION 1 /* of the saved format */
+#define GPH_VERSION 2 /* of the saved format */
 
 #ifndef GPH_API /* linkage of the functions; e.g. static */
 #define GPH_API extern
@@ -276,12 +277,13 @@ typedef struct gph_stats {
 
 /* ---- flat data of the sampling part (for queries and ports; not to be changed by callers) */
 
-/* A voxel as queries see it, 16 bytes. */
+/* A voxel as queries see it, 20 bytes. */
 typedef struct gph_voxel {
-    uint32_t map;  /* GPH_NONE: nothing is known */
-    float alpha;   /* probability of sampling the BSDF; 1 = do not guide */
-    float photons; /* that it has seen, half of its parents' counted */
-    uint16_t gate; /* GPH_GATE_... */
+    uint32_t map;    /* GPH_NONE: nothing is known */
+    float alpha;     /* probability of sampling the BSDF; 1 = do not guide */
+    float photons;   /* that it has seen, half of its parents' counted */
+    float reflected; /* see gph_handle */
+    uint16_t gate;   /* GPH_GATE_... */
     uint16_t level;
 } gph_voxel;
 enum { GPH_GATE_UNJUDGED, GPH_GATE_OPEN, GPH_GATE_CLOSED };
@@ -398,7 +400,7 @@ GPH_API gph_result gph_merge(gph_field *field, const gph_field *source, gph_para
 
 /* ---- >>query ------------------------------------------------------------------------------------------------ */
 
-/* What sampling and densities need; about 80 bytes. */
+/* What sampling and densities need; about 88 bytes. */
 typedef struct gph_handle {
     const uint16_t *weights; /* half-floats; NULL = uniform */
     const uint64_t *sums;    /* of the rows before */
@@ -411,6 +413,9 @@ typedef struct gph_handle {
     uint32_t rows, columns;
     float normal[3];
     uint32_t surface; /* 1: normal is one, directions below are mirrored up */
+    float reflected;  /* mean of contribution / pdf_mix in the voxel: the radiance that its surfaces reflect, W/m^2/sr;
+                         0 = not known. What a path can still bring here, for Russian roulette [Vorba 2016] */
+    uint32_t reserved;
 } gph_handle;
 
 #define GPH_PI 3.14159265358979324f
@@ -480,6 +485,7 @@ GPH_QUERY void gph_set_voxel(const gph_view *view, uint32_t voxel, gph_handle *h
     handle->columns = view->columns;
     handle->alpha = 1;
     handle->uniform = 1;
+    handle->reflected = voxel == GPH_NONE ? 0 : view->voxels[voxel].reflected;
     if (map != GPH_NONE) {
         const unsigned char *p = view->maps + (size_t)map * view->map_bytes;
         handle->sums = (const uint64_t *)(const void *)p;
@@ -721,6 +727,7 @@ GPH_API void gph_pdf_batch(const gph_view *view, uint32_t count, const uint32_t 
 #define GPHI_CONFIDENCE 1.645  /* one-sided 95 % of the normal distribution */
 #define GPHI_MIN_CLOSE 64.0    /* effective samples for the verdict "does not pay" */
 #define GPHI_MIN_OPEN 4.0      /* for "pays" */
+#define GPHI_MIN_SEEN 32.0     /* vertices of a voxel, those of earlier passes faded, for its reflected radiance */
 #define GPHI_MAX_VOXELS (1u << 26)
 #define GPHI_GROUP 16u /* positions looked up together */
 /* Instead of a voxel in a batch. */
@@ -801,6 +808,7 @@ typedef struct gphi_sums {
     double count;                       /* that V has seen */
     double q_bsdf, l_bsdf;              /* number and contributions of what the BSDF drew [eq. 14] */
     double q_guide, l_guide;            /* and of what the guide drew */
+    double flow;                        /* contributions / p of all these: what surfaces reflect */
     double v[GPHI_GATE], vv[GPHI_GATE]; /* sums of x_a = g^2 / (p p_a), and of x_a^2 */
     double cross[GPHI_GATE - 1];        /* of x_a x_1 */
 } gphi_sums;
@@ -825,6 +833,8 @@ typedef struct gphi_state {
     uint32_t probe;      /* closed: passes until the next try */
     uint32_t blocked;    /* found no memory: passing */
     float alpha;         /* learned */
+    float reflected;     /* mean of contribution / p when there were enough vertices last, 0 = there were not yet */
+    uint32_t spare;
 } gphi_state;
 
 /* A lit bin of a list, which is ordered by bin. */
@@ -1519,6 +1529,7 @@ static void gphi_vertex_add(gphi_sums *s, const gph_vertex *v, bool mapped)
     s->q_bsdf += v->strategy == GPH_FROM_BSDF;
     s->q_guide += v->strategy == GPH_FROM_GUIDE;
     *(v->strategy == GPH_FROM_BSDF ? &s->l_bsdf : &s->l_guide) += g;
+    s->flow += fmin(g / p, 1e30);
     if (!mapped || (g > 0 && !(v->pdf_guide > 0)))
         return;
     s->count += 1;
@@ -2028,14 +2039,23 @@ static void gphi_verdict(const gph_desc *desc, gphi_state *s, gph_stats *stats)
     }
 }
 
+/* Fold the sums after a pass. Without a map nothing was guided: eq. 14 has nothing to compare, V neither. What surfaces
+   reflect is the same under any guide. */
+static void gphi_fold_pass(gphi_state *s)
+{
+    double seen;
+    gphi_fold(s, s->map == GPH_NONE ? 0 : 0.5);
+    seen = s->held.q_bsdf + s->held.q_guide;
+    if (seen >= GPHI_MIN_SEEN)
+        s->reflected = (float)fmin(s->held.flow / seen, 1e30); /* a loaded sum may be larger */
+}
+
 /* After a pass: fold the sums, learn alpha, judge. A closed voxel waits, then is tried anew. */
 static void gphi_judge(gph_field *f, gphi_state *s)
 {
-    if (s->map == GPH_NONE) { /* nothing guided: eq. 14 has nothing to compare, V neither */
-        gphi_fold(s, 0);
+    gphi_fold_pass(s);
+    if (s->map == GPH_NONE)
         return;
-    }
-    gphi_fold(s, 0.5);
     if (s->verdict == GPH_GATE_CLOSED) {
         s->probe -= s->probe > 0;
         if (!s->probe) {
@@ -2560,6 +2580,7 @@ static void gphi_publish_maps(void *context, uint32_t begin, uint32_t end)
         gph_voxel *out = &gphi_block_voxels(p->block)[i];
         out->alpha = 1;
         out->photons = (float)v->s.photons;
+        out->reflected = v->s.reflected;
         out->level = (uint16_t)v->s.level;
         out->gate = (uint16_t)v->s.verdict;
         if (out->map == GPH_NONE)
@@ -3238,7 +3259,7 @@ static bool gphi_voxel_valid(const gph_field *f, const gphi_voxel *v)
     if (!gphi_sums_valid(&v->s.now) || !gphi_sums_valid(&v->s.held) || !(v->s.photons >= 0 && v->s.photons < 1e30) ||
         v->s.valid > 1 || v->s.rolled > f->stats.passes || (v->s.map != GPH_NONE && v->s.map >= f->block->maps) ||
         v->s.changed > 3 || v->sigma > GPHI_SIGMAS || v->s.verdict > GPH_GATE_CLOSED ||
-        !gphi_within_float(v->s.alpha, 0.04f, 1))
+        !gphi_within_float(v->s.alpha, 0.04f, 1) || !gphi_within_float(v->s.reflected, 0, 1e30f))
         return false;
     for (i = 0; i < n; ++i) {
         gphi_bin b = gphi_get_bin(v, f->bins, i);
@@ -3331,7 +3352,7 @@ static gph_result gphi_block_valid(const gph_field *f)
     for (i = 0; ok && i < b->voxels; ++i) {
         const gph_voxel *v = &gphi_block_voxels(b)[i];
         ok = t.seen[i] && (v->map == GPH_NONE || v->map < b->maps) && gphi_within_float(v->alpha, 0.04f, 1) &&
-             v->gate <= GPH_GATE_CLOSED && v->level <= 24;
+             gphi_within_float(v->reflected, 0, 1e30f) && v->gate <= GPH_GATE_CLOSED && v->level <= 24;
     }
     for (i = 0; ok && i < b->maps; ++i)
         ok = gphi_map_valid(gphi_block_map(b, i), f->desc.rows);

@@ -227,6 +227,14 @@ static void photon_pdf(void *method, int n, const int *index, const void *handle
     gph_pdf_batch(&m->view, (uint32_t)n, (const uint32_t *)index, handles, &wi->x, sizeof *wi, pdf);
 }
 
+static void photon_reflected(void *method, int n, const void *handles, float *radiance)
+{
+    const gph_handle *h = handles;
+    (void)method;
+    for (int i = 0; i < n; ++i)
+        radiance[i] = h[i].reflected;
+}
+
 /* ---- reports */
 
 /* Voxel number, and how many photons it has seen. */
@@ -276,10 +284,12 @@ const tr_method tr_method_photon = {.name = "photon",
                                     .find = photon_find,
                                     .sample = photon_sample,
                                     .pdf = photon_pdf,
+                                    .reflected = photon_reflected,
                                     .record = photon_record,
                                     .wants_photons = photon_wants_photons,
                                     .record_photons = photon_record_photons,
                                     .flush = photon_flush,
                                     .end_pass = photon_end_pass,
                                     .describe = photon_describe,
+                                    .wants_pixel_estimate = true,
                                     .stats = photon_stats};
