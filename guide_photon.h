@@ -100,10 +100,11 @@
      half-floats), 8 per node, 24 to 48 per cube. Building part: 360 bytes per voxel; its histogram is nothing while
      empty, a list of 16 bytes per lit bin below 256 photons, 12 n bytes above. The first pass's photons wait in 24
      bytes each, at most desc.cloud_photons. refine makes a new sampling part beside the old one, whose memory is kept
-     for the next; from the second on each has up to a quarter to spare. max_bytes bounds all of this together: beyond
-     it cubes, histograms and splits are denied and counted. Allocation happens in create, stream_create, record,
-     accumulate, refine, load; never in a query, and always from the calling thread. Stack: below 140 KB per call of
-     refine and gph_import_maps, 8 KB for others.
+     for the next, from the second on with up to a quarter to spare: as far as all this together stays within 8 times
+   the half-floats of all maps, which it does not where most histograms are dense. max_bytes bounds all of this
+     together: beyond it cubes, histograms and splits are denied and counted. Allocation happens in create,
+     stream_create, record, accumulate, refine, load; never in a query, and always from the calling thread. Stack: below
+     140 KB per call of refine and gph_import_maps, 8 KB for others.
 
    THREADS: each function has a tag.
      [any thread]   pure function on constant data
@@ -357,6 +358,9 @@ GPH_API gph_result gph_refine(gph_field *field, gph_parallel_fn parallel, void *
 GPH_API bool gph_all_closed(const gph_field *field);
 /* True where a photon at this position would be kept in this pass; to end photon paths early. [any thread] */
 GPH_API bool gph_takes_photons(const gph_field *field, const float position[3]);
+/* How many photons the voxel at this position has seen by the last accumulate; negative where it takes none. What
+   another one would be worth there, to decide where to send them. [any thread] */
+GPH_API double gph_photons_at(const gph_field *field, const float position[3]);
 
 GPH_API void gph_get_stats(const gph_field *field, gph_stats *stats); /* [any thread] */
 /* Check every index and sum of both parts: GPH_OK, GPH_CORRUPT or GPH_OUT_OF_MEMORY. [any thread] */
@@ -1834,10 +1838,31 @@ GPH_API gph_result gph_accumulate(gph_field *field, gph_stream *const *streams, 
 
 /* ---- >>cloud ------------------------------------------------------------------------------------------------ */
 
-static int gphi_ascending(const void *a, const void *b)
+/* The k-th smallest of n numbers, k < n; they are moved (Hoare's selection, the middle one as pivot). */
+static float gphi_select(float *x, uint32_t n, uint32_t k)
 {
-    float x = *(const float *)a, y = *(const float *)b;
-    return (x > y) - (x < y);
+    uint32_t low = 0, high = n - 1;
+    while (low < high) {
+        float pivot = x[low + (high - low) / 2];
+        uint32_t i = low, j = high;
+        for (;; ++i, --j) {
+            float t;
+            while (x[i] < pivot)
+                ++i;
+            while (x[j] > pivot)
+                --j;
+            if (i >= j)
+                break;
+            t = x[i];
+            x[i] = x[j];
+            x[j] = t;
+        }
+        if (k <= j) /* what is at or before j is at most the pivot, what follows at least */
+            high = j;
+        else
+            low = j + 1;
+    }
+    return x[k];
 }
 
 /* The photons of one leaf, as indices into the cloud. */
@@ -1850,14 +1875,17 @@ typedef struct gphi_group {
 /* Median of the photons' coordinates along an axis, the photon itself above it; false where all are the same. */
 static bool gphi_median(const gphi_group *g, const uint32_t *photons, uint32_t count, uint32_t axis, float *split)
 {
-    uint32_t i, at = count / 2;
-    for (i = 0; i < count; ++i)
+    float least = INFINITY, median, next = INFINITY; /* next: smallest that is more than the least */
+    uint32_t i;
+    for (i = 0; i < count; ++i) {
         g->numbers[i] = g->field->cloud[photons[i]].position[axis];
-    qsort(g->numbers, count, sizeof *g->numbers, gphi_ascending);
-    while (at < count && !(g->numbers[at] > g->numbers[0])) /* something must lie below */
-        ++at;
-    *split = at < count ? g->numbers[at] : 0;
-    return at < count;
+        least = g->numbers[i] < least ? g->numbers[i] : least;
+    }
+    for (i = 0; i < count; ++i)
+        next = g->numbers[i] > least && g->numbers[i] < next ? g->numbers[i] : next;
+    median = gphi_select(g->numbers, count, count / 2);
+    *split = median > least ? median : next; /* something must lie below */
+    return next < INFINITY;
 }
 
 /* Cut a leaf at the median of its photons, and its halves, while they have more than the threshold. */
@@ -2622,11 +2650,17 @@ static void gphi_publish_cubes(const gph_field *f, gphi_block *b)
     }
 }
 
+/* Whether all this, with so many bytes of sampling parts, is within 8 times the half-floats of all maps. */
+static bool gphi_lean(const gph_field *f, uint64_t parts)
+{
+    return gphi_held(f) - f->block_bytes - f->spare_bytes + parts <= 16 * (uint64_t)f->bins * f->mapped;
+}
+
 /* See that the spare block has room for `size` bytes, and not for many more. After the first refine a new one has a
-   quarter more where max_bytes allows: fresh memory is slow, zeroed by the system page by page. */
+   quarter more where there is room: fresh memory is slow, zeroed by the system page by page. */
 static bool gphi_spare_room(gph_field *f, uint64_t size)
 {
-    uint64_t bytes = f->stats.passes ? size + size / 4 : size;
+    uint64_t bytes = f->stats.passes && gphi_lean(f, size + size / 4) ? size + size / 4 : size;
     if (f->spare && size <= f->spare_bytes && f->spare_bytes / 2 <= bytes)
         return true;
     gphi_drop_spare(f);
@@ -2676,7 +2710,7 @@ static void gphi_swap_blocks(gph_field *f)
     f->block_bytes = f->spare_bytes;
     f->spare = old;
     f->spare_bytes = bytes;
-    if (bytes / 2 > f->block->size + f->block->size / 4)
+    if (bytes / 2 > f->block->size + f->block->size / 4 || !gphi_lean(f, f->block_bytes + f->spare_bytes))
         gphi_drop_spare(f);
 }
 
@@ -2788,10 +2822,15 @@ GPH_API gph_result gph_refine(gph_field *field, gph_parallel_fn parallel, void *
 
 GPH_API bool gph_all_closed(const gph_field *field) { return field->guiding == 0; }
 
-GPH_API bool gph_takes_photons(const gph_field *field, const float position[3])
+GPH_API double gph_photons_at(const gph_field *field, const float position[3])
 {
     uint32_t voxel = gphi_find(field, position);
-    return voxel != GPH_NONE && field->voxels[voxel].s.valid;
+    return voxel != GPH_NONE && field->voxels[voxel].s.valid ? field->voxels[voxel].s.photons : -1;
+}
+
+GPH_API bool gph_takes_photons(const gph_field *field, const float position[3])
+{
+    return gph_photons_at(field, position) >= 0;
 }
 
 GPH_API void gph_get_stats(const gph_field *field, gph_stats *stats)

@@ -894,6 +894,26 @@ static void test_first_pass_is_cut_at_the_median(void **state)
     gph_destroy(f);
 }
 
+/* Against sorting, with many that are equal. */
+static void test_selection_finds_what_sorting_finds(void **state)
+{
+    (void)state;
+    seed(43);
+    for (int i = 0; i < 3000; ++i) {
+        enum { MOST = 70 };
+        float x[MOST], sorted[MOST];
+        uint32_t n = 1 + (uint32_t)(rnd() * MOST) % MOST, k = (uint32_t)(rnd() * n) % n, values = 1 + (uint32_t)i % 9;
+        for (uint32_t j = 0; j < n; ++j) {
+            uint32_t at = j;
+            x[j] = i % 3 ? (float)((uint32_t)(rnd() * 9) % values) : rndf();
+            for (; at > 0 && sorted[at - 1] > x[j]; --at)
+                sorted[at] = sorted[at - 1];
+            sorted[at] = x[j];
+        }
+        assert_true(gphi_select(x, n, k) == sorted[k]);
+    }
+}
+
 static void test_later_passes_are_cut_in_the_middle_and_halves_inherit(void **state)
 {
     (void)state;
@@ -1014,6 +1034,16 @@ static void test_memory_of_a_voxel_is_bounded(void **state)
                 assert_true(s.sparse == VOXELS && building <= 2 * 16 * counts[i] + 128);
             else
                 assert_true(s.sparse == 0 && building == 12.0 * f->bins);
+            for (int pass = 1; pass < 5; ++pass) { /* what refine keeps for the next time is within that too */
+                for (int k = 0; k < VOXELS; ++k) {
+                    p[0] = ((float)k + 0.5f) / VOXELS;
+                    gph_vertex v = touch(p);
+                    gph_photon q = gph_make_photon(p, mean_a, 1, 1);
+                    learn(f, &v, 1, &q, counts[i] > 0);
+                }
+                OK(gph_refine(f, NULL, NULL));
+                assert_true((double)(c.bytes - empty) / VOXELS <= 8 * (double)half);
+            }
             gph_destroy(f);
             assert_int_equal(c.live, 0);
         }
@@ -1802,6 +1832,7 @@ int main(void)
         cmocka_unit_test(test_only_places_of_camera_paths_take_photons),
         cmocka_unit_test(test_first_vertices_give_the_box),
         cmocka_unit_test(test_first_pass_is_cut_at_the_median),
+        cmocka_unit_test(test_selection_finds_what_sorting_finds),
         cmocka_unit_test(test_later_passes_are_cut_in_the_middle_and_halves_inherit),
         cmocka_unit_test(test_unread_voxels_are_recycled),
         cmocka_unit_test(test_memory_of_a_voxel_is_bounded),
