@@ -838,7 +838,7 @@ typedef struct gphi_state {
     uint32_t blocked;    /* found no memory: passing */
     float alpha;         /* learned */
     float reflected;     /* mean of contribution / p when there were enough vertices last, 0 = there were not yet */
-    uint32_t spare;
+    float chosen;        /* photons when the Gaussian's sigma was chosen; 0 = it is to be chosen */
 } gphi_state;
 
 /* A lit bin of a list, which is ordered by bin. */
@@ -982,6 +982,7 @@ static void gphi_halve(gphi_voxel *v, uint32_t bins)
     }
     v->s.photons *= 0.5;
     v->s.fresh /= 2;
+    v->s.chosen = 0; /* half as large, other light */
 }
 
 /* Give a voxel room for `more` entries. bytes: what that took. False: out of memory, nothing changed. */
@@ -2378,8 +2379,8 @@ static double gphi_likelihood(const gph_field *f, const gphi_voxel *v, float *ma
 
 #define GPHI_SIGMAS 8
 
-/* The likeliest sigma of the Gaussian: from the one chosen last up while that is likelier, else down. */
-static double gphi_choose_sigma(const gph_field *f, gphi_voxel *v, float *map, float *scratch)
+/* Blur a map by the likeliest sigma of the Gaussian: from the one chosen last up while that is likelier, else down. */
+static void gphi_blur_likeliest(const gph_field *f, gphi_voxel *v, float *map, float *scratch)
 {
     static const double sigmas[GPHI_SIGMAS] = {0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0};
     double best, sum = 0, scale = f->desc.rows / 32.0;
@@ -2387,7 +2388,12 @@ static double gphi_choose_sigma(const gph_field *f, gphi_voxel *v, float *map, f
     uint32_t i;
     for (i = 0; i < f->bins; ++i)
         sum += (double)map[i];
+    if (v->sigma && v->s.photons < 2 * (double)v->s.chosen) { /* it falls with a small root of the photons */
+        gphi_blur(map, scratch, (int)f->desc.rows, 2 * (int)f->desc.rows, sigmas[at] * scale);
+        return;
+    }
     best = gphi_likelihood(f, v, map, scratch, sum, sigmas[at] * scale);
+    memcpy(scratch + f->bins, map + f->bins, f->bins * sizeof *map);
     for (step = 1; step >= -1 && at == from; step -= 2)
         while (at + step >= 0 && at + step < GPHI_SIGMAS) {
             double likely = gphi_likelihood(f, v, map, scratch, sum, sigmas[at + step] * scale);
@@ -2395,9 +2401,11 @@ static double gphi_choose_sigma(const gph_field *f, gphi_voxel *v, float *map, f
                 break;
             best = likely;
             at += step;
+            memcpy(scratch + f->bins, map + f->bins, f->bins * sizeof *map);
         }
+    memcpy(map, scratch + f->bins, f->bins * sizeof *map);
     v->sigma = (uint32_t)at + 1;
-    return sigmas[at] * scale;
+    v->s.chosen = (float)v->s.photons;
 }
 
 /* Value of a coarse map [rows][columns] at the centre of bin (r, c) of the map twice as fine: linear interpolation. */
@@ -2465,8 +2473,10 @@ static void gphi_repair_map(const gph_field *f, gphi_voxel *v, float *map, float
         scratch[b.at] = *b.count_old || *b.count_now ? 1.0f : 0.0f;
     }
     if (f->desc.repair == GPH_REPAIR_GAUSSIAN) {
-        double sigma = f->desc.sigma > 0 ? (double)f->desc.sigma : gphi_choose_sigma(f, v, map, scratch);
-        gphi_blur(map, scratch, rows, columns, sigma);
+        if (f->desc.sigma > 0)
+            gphi_blur(map, scratch, rows, columns, (double)f->desc.sigma);
+        else
+            gphi_blur_likeliest(f, v, map, scratch);
     } else if (f->desc.repair == GPH_REPAIR_PYRAMID)
         gphi_pyramid(map, NULL, rows, columns, (int)f->desc.pyramid_levels);
     else if (f->desc.repair == GPH_REPAIR_PULL_PUSH)
@@ -2501,36 +2511,36 @@ static bool gphi_sum_weights(unsigned char *map, uint32_t rows, bool compare)
 {
     uint64_t *sums = (uint64_t *)(void *)map, *blocks = gphi_map_blocks(map, rows), sum = 0;
     const uint16_t *weights = gphi_map_weights(map, rows);
-    uint32_t i, bins = rows * rows * 2;
+    uint32_t i, k, bins = rows * rows * 2;
     bool same = true;
-    for (i = 0; i <= bins; ++i) {
-        uint64_t *to[2];
-        int k;
-        to[0] = i % (2 * rows) == 0 ? &sums[i / (2 * rows)] : NULL;
-        to[1] = i % 8 == 0 && i < bins ? &blocks[i / 8] : NULL;
-        for (k = 0; k < 2; ++k)
-            if (to[k]) {
-                same = same && *to[k] == sum;
-                *to[k] = compare ? *to[k] : sum;
-            }
-        sum += i < bins ? gph_weight(weights[i]) : 0;
+    for (i = 0; i < bins / 8; ++i) {
+        uint64_t *row = i % (rows / 4) == 0 ? &sums[i / (rows / 4)] : &blocks[i];
+        same = same && blocks[i] == sum && *row == sum;
+        if (!compare)
+            blocks[i] = *row = sum;
+        for (k = 0; k < 8; ++k)
+            sum += gph_weight(weights[8 * i + k]);
     }
-    return same && sum > 0;
+    same = same && sums[rows] == sum;
+    if (!compare)
+        sums[rows] = sum;
+    return (same || !compare) && sum > 0;
 }
 
 /* A map of values >= 0 as weights whose largest is 2^15, with their sums. False, and nothing written, without light. */
 static bool gphi_write_map(unsigned char *to, const float *map, uint32_t rows)
 {
     uint16_t *weights = gphi_map_weights(to, rows);
-    double most = 0, scale;
+    float most = 0;
+    double scale;
     uint32_t i, bins = rows * rows * 2;
     for (i = 0; i < bins; ++i)
-        most = (double)map[i] > most ? (double)map[i] : most;
+        most = map[i] > most ? map[i] : most;
     if (!(most > 0 && most < INFINITY))
         return false;
-    scale = 32768 / most;
+    scale = 32768 / (double)most;
     for (i = 0; i < bins; ++i)
-        weights[i] = map[i] > 0 ? gphi_half((float)fmin((double)map[i] * scale, 32768)) : 0;
+        weights[i] = map[i] > 0 ? gphi_half((float)((double)map[i] * scale)) : 0;
     memset(to + (rows + 1) * 8, 0, 56); /* between the sums of rows and of eights */
     gphi_sum_weights(to, rows, false);
     return true;
@@ -3298,7 +3308,8 @@ static bool gphi_voxel_valid(const gph_field *f, const gphi_voxel *v)
     if (!gphi_sums_valid(&v->s.now) || !gphi_sums_valid(&v->s.held) || !(v->s.photons >= 0 && v->s.photons < 1e30) ||
         v->s.valid > 1 || v->s.rolled > f->stats.passes || (v->s.map != GPH_NONE && v->s.map >= f->block->maps) ||
         v->s.changed > 3 || v->sigma > GPHI_SIGMAS || v->s.verdict > GPH_GATE_CLOSED ||
-        !gphi_within_float(v->s.alpha, 0.04f, 1) || !gphi_within_float(v->s.reflected, 0, 1e30f))
+        !gphi_within_float(v->s.alpha, 0.04f, 1) || !gphi_within_float(v->s.reflected, 0, 1e30f) ||
+        !gphi_within_float(v->s.chosen, 0, 1e30f))
         return false;
     for (i = 0; i < n; ++i) {
         gphi_bin b = gphi_get_bin(v, f->bins, i);
