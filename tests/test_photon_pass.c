@@ -1068,7 +1068,7 @@ static tr_emission_map *learned_map(int tiles)
                 assert_true(tr_emission_record(map, i * tiles / N, u, density, 1));
         }
         tr_emission_flush(map);
-        tr_emission_learn(map, N);
+        tr_emission_learn(map);
     }
     return map;
 }
@@ -1081,7 +1081,7 @@ static void emission_map_is_a_density(void **state)
     tr_rng rng = rng_seed(6, 6);
     double volume[5][4] = {{0}}, squares[5][4] = {{0}}, inside = 0;
     enum { N = 200000 };
-    assert_true(tr_emission_gain(map) > 2);
+    assert_true(tr_emission_gain(map) > 1.4);
     for (int i = 0; i < N; ++i) {
         float u[5], v[5], density;
         random_numbers(&rng, u);
@@ -1103,8 +1103,8 @@ static void emission_map_is_a_density(void **state)
             if (!(fabs(mean - 0.25) < 4.5 * sigma))
                 fail_msg("axis %d, quarter %d: %g, sigma %g", k, q, mean, sigma);
         }
-    /* The best share of the box has the root of 1 + m there, and of m (1 + m) around it; a quarter stays even. */
-    double box = sqrt(2.0) / 32, rest = sqrt(0.02 * 1.02) * 31 / 32, best = 0.75 * box / (box + rest) + 0.25 / 32;
+    /* The best density is as the root of how many are of use; a quarter stays even. */
+    double box = 1.0 / 32, rest = sqrt(0.02) * 31 / 32, best = 0.75 * box / (box + rest) + 0.25 / 32;
     assert_true(fabs(inside / N - best) < 0.1 * best);
     tr_emission_destroy(map);
     tr_emission_destroy(other);
@@ -1124,11 +1124,11 @@ static void even_use_leaves_emission_even(void **state)
             memcpy(v, u, sizeof v);
             assert_true(tr_emission_warp(map, u) == 1);
             assert_memory_equal(u, v, sizeof u);
-            for (int hit = 0; hit < 3; ++hit)
-                assert_true(tr_emission_record(map, 0, u, 1, 1));
+            for (int hit = 0; hit < (i % 1000 ? 2 : 50); ++hit) /* a path that comes often is still one */
+                assert_true(tr_emission_record(map, 0, u, 1, i % 1000 ? 1 : 0.04f));
         }
         tr_emission_flush(map);
-        tr_emission_learn(map, 20000);
+        tr_emission_learn(map);
     }
     assert_true(tr_emission_gain(map) == 1);
     tr_emission_destroy(map);
@@ -1172,7 +1172,7 @@ static void guided_emission_keeps_the_flux(void **state)
         pass.seed = 99;
         assert_true(tr_trace_photons(&pass, record_inside, &l, NULL));
         tr_emission_flush(l.map);
-        tr_emission_learn(l.map, 1 << 15);
+        tr_emission_learn(l.map);
     }
     assert_true(tr_emission_gain(l.map) > 5);
     receiver r[2] = {{.half = 0.2}, {.half = 4}};

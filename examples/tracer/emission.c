@@ -10,9 +10,8 @@
 
    A voxel that has M photons knows its light to about 1 / M of its variance, and a path that brings it h more changes
    that by h / M: the mean over all places of the squared relative error is least with a density proportional to the
-   root of E[sum of (h / M)^2]. In a box where a path brings m photons of use on average, that is about (1 + m) times
-   the sum of 1 / M^2 over them. A share of all paths stays even: no photon weighs more than 1 / EVEN of what it would.
- */
+   root of E[(sum of 1 / M over the path's photons)^2]. A share of all paths stays even: no photon weighs more than 1 /
+   EVEN of what it would. */
 #include "emission.h"
 
 #include <stdlib.h>
@@ -21,17 +20,17 @@
 #define AXES 5
 #define EVEN 0.25f      /* share of paths that are drawn evenly */
 #define KEPT (1u << 15) /* samples; where there are more, every second is kept, then every fourth, ... */
-#define MIN_SAMPLES 12u /* of a box that is cut */
-#define MIN_CHI 20.0    /* of a box that is cut: 3 degrees of freedom, one in 6,000 by chance */
-#define MAX_CUTS 16     /* of one axis: the numbers have 24 bits */
-#define MIN_GAIN 1.25   /* variance with even paths over that with guided ones, that guiding is to promise */
-#define FADE 0.5f       /* of a pass's samples in the next one: by then more is known where they came */
+#define MIN_SAMPLES 4u  /* of a box that is cut */
+#define MIN_CHI 11.5  /* of a box that is cut: 3 degrees of freedom, one in 100 by chance; four paths in one quarter */
+#define MAX_CUTS 8    /* of one axis */
+#define MIN_GAIN 1.25 /* variance with even paths over that with guided ones, that guiding is to promise */
+#define FADE 0.7f     /* of a pass's samples in the next one: by then more is known where they came */
 #define BOXES 8192u
 #define BELOW_ONE 0x1.fffffep-1f
 
 typedef struct sample {
     float u[AXES], weight; /* weight: 1 / density */
-    float need;            /* weight / M^2, faded */
+    float need;            /* sum of 1 / M over its photons, faded */
 } sample;
 
 /* A box; its halves are children and children + 1, unless it is a leaf. */
@@ -51,8 +50,7 @@ struct tr_emission_map {
     int tile_count;
     sample *kept;
     uint32_t count;
-    uint64_t seen, every; /* of the samples, each every-th is kept */
-    double paths;         /* of all passes */
+    uint32_t halvings; /* of the paths, one of every 2^halvings is kept */
     box *boxes;
     uint32_t box_count;
     bool guides;
@@ -68,7 +66,6 @@ tr_emission_map *tr_emission_create(int tiles)
     e->kept = malloc(KEPT * sizeof *e->kept);
     e->boxes = malloc(BOXES * sizeof *e->boxes);
     e->tile_count = e->tiles ? tiles : 0;
-    e->every = 1;
     e->gain = 1;
     if (e->tiles && e->kept && e->boxes)
         return e;
@@ -105,27 +102,61 @@ bool tr_emission_record(tr_emission_map *e, int tile, const float u[5], float de
     }
     memcpy(t->samples[t->count].u, u, sizeof t->samples->u);
     t->samples[t->count].weight = 1 / density;
-    t->samples[t->count++].need = need * need / density;
+    t->samples[t->count++].need = need;
     return true;
 }
 
-/* Every second sample goes. */
-static void thin(tr_emission_map *e)
+static int by_path(const void *a, const void *b)
 {
-    for (uint32_t i = 0; i < KEPT / 2; ++i)
-        e->kept[i] = e->kept[2 * i];
-    e->count = KEPT / 2;
-    e->every *= 2;
+    const sample *x = a, *y = b;
+    int order = memcmp(x->u, y->u, sizeof x->u);
+    return order ? order : (x->need > y->need) - (x->need < y->need); /* sums are to have one order */
+}
+
+/* Samples of one path become one. */
+static void join_paths(tr_emission_map *e)
+{
+    uint32_t n = 0;
+    qsort(e->kept, e->count, sizeof *e->kept, by_path);
+    for (uint32_t i = 0; i < e->count; ++i)
+        if (n && !memcmp(e->kept[n - 1].u, e->kept[i].u, sizeof e->kept->u))
+            e->kept[n - 1].need += e->kept[i].need;
+        else
+            e->kept[n++] = e->kept[i];
+    e->count = n;
+}
+
+/* Whether a path is one of every 2^halvings that are kept. */
+static bool keeps(const tr_emission_map *e, const float u[AXES])
+{
+    uint32_t bits[4];
+    memcpy(bits, u + 1, sizeof bits);
+    uint64_t h = tr_hash64((uint64_t)bits[0] << 32 | bits[1]) ^ ((uint64_t)bits[2] << 32 | bits[3]);
+    return (tr_hash64(h) & ((UINT64_C(1) << e->halvings) - 1)) == 0;
+}
+
+/* Half of the paths go, unless joining makes as much room. */
+static void make_room(tr_emission_map *e)
+{
+    uint32_t n = 0;
+    join_paths(e);
+    if (e->count <= KEPT / 2)
+        return;
+    e->halvings++;
+    for (uint32_t i = 0; i < e->count; ++i)
+        if (keeps(e, e->kept[i].u))
+            e->kept[n++] = e->kept[i];
+    e->count = n;
 }
 
 void tr_emission_flush(tr_emission_map *e)
 {
     for (int t = 0; t < e->tile_count; ++t) {
         for (uint32_t i = 0; i < e->tiles[t].count; ++i) {
-            if (e->seen++ % e->every)
+            if (!keeps(e, e->tiles[t].samples[i].u))
                 continue;
             if (e->count == KEPT)
-                thin(e);
+                make_room(e);
             e->kept[e->count++] = e->tiles[t].samples[i];
         }
         e->tiles[t].count = 0;
@@ -141,16 +172,20 @@ typedef struct part {
     double volume;
 } part;
 
+/* What a path adds to the second moment, as an even one would. */
+static double square(const sample *s) { return (double)s->weight * s->need * s->need; }
+
 /* The axis on which the samples are least even, by quarters; AXES = even on all, or too few. */
 static int uneven_axis(const part *p, const sample *s, uint32_t n)
 {
     double best = MIN_CHI, weight[AXES][4] = {{0}}, squares = 0;
     int axis = AXES;
     for (uint32_t i = 0; i < n && n >= MIN_SAMPLES; ++i) {
-        squares += (double)s[i].need * s[i].need;
+        double x = square(&s[i]);
+        squares += x * x;
         for (int k = 0; k < AXES; ++k) {
             int q = (int)ldexpf(s[i].u[k] - p->low[k], p->cuts[k] + 2);
-            weight[k][q < 0 ? 0 : q > 3 ? 3 : q] += s[i].need;
+            weight[k][q < 0 ? 0 : q > 3 ? 3 : q] += x;
         }
     }
     for (int k = 0; k < AXES && squares > 0; ++k) {
@@ -185,13 +220,10 @@ static double build(tr_emission_map *e, uint32_t at, const part *p, sample *s, u
     box *b = &e->boxes[at];
     b->axis = (uint8_t)axis;
     if (axis == AXES) {
-        double m = 0, need = 0;
-        for (uint32_t i = 0; i < n; ++i) {
-            m += s[i].weight;
-            need += s[i].need;
-        }
-        m *= (double)e->every / (e->paths * p->volume);
-        b->lower = (float)sqrt((1 + m) * need / p->volume);
+        double sum = 0;
+        for (uint32_t i = 0; i < n; ++i)
+            sum += square(&s[i]);
+        b->lower = (float)sqrt(sum / p->volume);
         return (double)b->lower * p->volume;
     }
     part half = *p;
@@ -228,13 +260,13 @@ static void mix(tr_emission_map *e, uint32_t at, double mass, double volume, dou
     mix(e, b->children + 1u, above, 0.5 * volume, total, variance);
 }
 
-void tr_emission_learn(tr_emission_map *e, double paths)
+void tr_emission_learn(tr_emission_map *e)
 {
     part p = {.volume = 1};
     double variance[2] = {0, 0};
-    e->paths += paths;
     e->guides = false;
-    if (!(e->paths > 0) || e->count < MIN_SAMPLES)
+    join_paths(e);
+    if (e->count < MIN_SAMPLES)
         return;
     e->box_count = 1;
     double mass = build(e, 0, &p, e->kept, e->count);

@@ -12,8 +12,7 @@ void tr_emission_destroy(tr_emission_map *map);
    relative error there falls with them. Streams as in tr_photon_fn. False = out of memory. */
 bool tr_emission_record(tr_emission_map *map, int tile, const float u[5], float density, float need);
 void tr_emission_flush(tr_emission_map *map); /* take in what the tiles recorded */
-/* A pass of so many paths has ended: learn from all so far. */
-void tr_emission_learn(tr_emission_map *map, double paths);
+void tr_emission_learn(tr_emission_map *map); /* a pass has ended: learn from all so far */
 /* Variance of what photons tell with even paths, over that with these, as far as is known; 1 = it does not guide, for
    there is nothing or little to gain. */
 double tr_emission_gain(const tr_emission_map *map);

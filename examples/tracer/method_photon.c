@@ -269,7 +269,7 @@ static bool photon_end_pass(void *method, const tr_pass *pass)
     gph_result result = gph_refine(m->field, m->parallel, m->parallel_user);
     m->view = gph_get_view(m->field);
     if (m->emission && m->flux > 0)
-        tr_emission_learn(m->emission, m->flux);
+        tr_emission_learn(m->emission);
     photon_judge(m, pass);
     return !result;
 }
