@@ -96,7 +96,7 @@ TRACER_OBJ := $(TRACER_SRC:examples/tracer/%.c=$(B)/obj/tracer/%.o) $(if $(OPENP
 PROGRAMS := $(patsubst examples/tracer/%.c,$(B)/%,$(wildcard $(TRACER_MAINS:%=examples/tracer/%.c)))
 EXAMPLES := $(patsubst examples/%.c,$(B)/examples/%,$(wildcard examples/*.c))
 TESTS_ALL := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/test_*.c))
-MICRO := $(B)/bench_sdtree $(B)/bench_kd $(B)/bench_field $(B)/bench_denoise $(B)/bench_nn
+MICRO := $(B)/bench_sdtree $(B)/bench_kd $(B)/bench_photon $(B)/bench_field $(B)/bench_denoise $(B)/bench_nn
 BENCHES := $(patsubst bench/%.c,$(B)/%,$(wildcard bench/bench_*.c))
 STRESSES := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/stress_*.c))
 # Programs of bench/ that are not timings: `make bench` does not run them.

@@ -96,14 +96,15 @@
    OPTIONS: see gph_desc. gph_resolve fills in defaults, gph_get_desc returns what a field uses.
 
    MEMORY
-     n = bins (rows * rows * 2). Sampling part: 16 bytes per voxel, 3 n + 8 rows + 64 per map (1.58 times its
-     half-floats), 8 per node, 24 to 48 per cube. Building part: 336 bytes per voxel; its histogram is nothing while
+     n = bins (rows * rows * 2). Sampling part: 20 bytes per voxel, 3 n + 8 rows + 64 per map (1.58 times its
+     half-floats), 8 per node, 24 to 48 per cube. Building part: 360 bytes per voxel; its histogram is nothing while
      empty, a list of 16 bytes per lit bin below 256 photons, 12 n bytes above. The first pass's photons wait in 24
      bytes each, at most desc.cloud_photons. refine makes a new sampling part beside the old one, whose memory is kept
-     for the next; from the second on each has up to a quarter to spare. max_bytes bounds all of this together: beyond
-     it cubes, histograms and splits are denied and counted. Allocation happens in create, stream_create, record,
-     accumulate, refine, load; never in a query, and always from the calling thread. Stack: below 140 KB per call of
-     refine and gph_import_maps, 8 KB for others.
+     for the next, from the second on with up to a quarter to spare: as far as all this together stays within 8 times
+   the half-floats of all maps, which it does not where most histograms are dense. max_bytes bounds all of this
+     together: beyond it cubes, histograms and splits are denied and counted. Allocation happens in create,
+     stream_create, record, accumulate, refine, load; never in a query, and always from the calling thread. Stack: below
+     140 KB per call of refine and gph_import_maps, 8 KB for others.
 
    THREADS: each function has a tag.
      [any thread]   pure function on constant data
@@ -128,6 +129,7 @@
      S. Zhu, Z. Xu, T. Sun, A. Kuznetsov, M. Meyer, H. W. Jensen, H. Su, R. Ramamoorthi 2021a, Photon-Driven Neural
      Reconstruction for Path Guiding. Equations without a name are from there.
      H. W. Jensen 1995, Importance Driven Path Tracing Using the Photon Map.
+     J. Vorba, J. Krivanek 2016, Adjoint-Driven Russian Roulette and Splitting in Light Transport Simulation.
      S. Gortler, R. Grzeszczuk, R. Szeliski, M. Cohen 1996, The Lumigraph. (pull-push) */
 #ifndef GUIDE_PHOTON_H
 #define GUIDE_PHOTON_H
@@ -140,7 +142,7 @@
 #include <stdint.h>
 #include <string.h>
 
-#define GPH_VERSION 1 /* of the saved format */
+#define GPH_VERSION 2 /* of the saved format */
 
 #ifndef GPH_API /* linkage of the functions; e.g. static */
 #define GPH_API extern
@@ -276,12 +278,13 @@ typedef struct gph_stats {
 
 /* ---- flat data of the sampling part (for queries and ports; not to be changed by callers) */
 
-/* A voxel as queries see it, 16 bytes. */
+/* A voxel as queries see it, 20 bytes. */
 typedef struct gph_voxel {
-    uint32_t map;  /* GPH_NONE: nothing is known */
-    float alpha;   /* probability of sampling the BSDF; 1 = do not guide */
-    float photons; /* that it has seen, half of its parents' counted */
-    uint16_t gate; /* GPH_GATE_... */
+    uint32_t map;    /* GPH_NONE: nothing is known */
+    float alpha;     /* probability of sampling the BSDF; 1 = do not guide */
+    float photons;   /* that it has seen, half of its parents' counted */
+    float reflected; /* see gph_handle */
+    uint16_t gate;   /* GPH_GATE_... */
     uint16_t level;
 } gph_voxel;
 enum { GPH_GATE_UNJUDGED, GPH_GATE_OPEN, GPH_GATE_CLOSED };
@@ -355,6 +358,9 @@ GPH_API gph_result gph_refine(gph_field *field, gph_parallel_fn parallel, void *
 GPH_API bool gph_all_closed(const gph_field *field);
 /* True where a photon at this position would be kept in this pass; to end photon paths early. [any thread] */
 GPH_API bool gph_takes_photons(const gph_field *field, const float position[3]);
+/* How many photons the voxel at this position has seen by the last accumulate; negative where it takes none. What
+   another one would be worth there, to decide where to send them. [any thread] */
+GPH_API double gph_photons_at(const gph_field *field, const float position[3]);
 
 GPH_API void gph_get_stats(const gph_field *field, gph_stats *stats); /* [any thread] */
 /* Check every index and sum of both parts: GPH_OK, GPH_CORRUPT or GPH_OUT_OF_MEMORY. [any thread] */
@@ -398,7 +404,7 @@ GPH_API gph_result gph_merge(gph_field *field, const gph_field *source, gph_para
 
 /* ---- >>query ------------------------------------------------------------------------------------------------ */
 
-/* What sampling and densities need; about 80 bytes. */
+/* What sampling and densities need; about 88 bytes. */
 typedef struct gph_handle {
     const uint16_t *weights; /* half-floats; NULL = uniform */
     const uint64_t *sums;    /* of the rows before */
@@ -411,6 +417,9 @@ typedef struct gph_handle {
     uint32_t rows, columns;
     float normal[3];
     uint32_t surface; /* 1: normal is one, directions below are mirrored up */
+    float reflected;  /* mean of contribution / pdf_mix in the voxel: the radiance that its surfaces reflect, W/m^2/sr;
+                         0 = not known. What a path can still bring here, for Russian roulette [Vorba 2016] */
+    uint32_t reserved;
 } gph_handle;
 
 #define GPH_PI 3.14159265358979324f
@@ -480,6 +489,7 @@ GPH_QUERY void gph_set_voxel(const gph_view *view, uint32_t voxel, gph_handle *h
     handle->columns = view->columns;
     handle->alpha = 1;
     handle->uniform = 1;
+    handle->reflected = voxel == GPH_NONE ? 0 : view->voxels[voxel].reflected;
     if (map != GPH_NONE) {
         const unsigned char *p = view->maps + (size_t)map * view->map_bytes;
         handle->sums = (const uint64_t *)(const void *)p;
@@ -721,6 +731,7 @@ GPH_API void gph_pdf_batch(const gph_view *view, uint32_t count, const uint32_t 
 #define GPHI_CONFIDENCE 1.645  /* one-sided 95 % of the normal distribution */
 #define GPHI_MIN_CLOSE 64.0    /* effective samples for the verdict "does not pay" */
 #define GPHI_MIN_OPEN 4.0      /* for "pays" */
+#define GPHI_MIN_SEEN 32.0     /* vertices of a voxel, those of earlier passes faded, for its reflected radiance */
 #define GPHI_MAX_VOXELS (1u << 26)
 #define GPHI_GROUP 16u /* positions looked up together */
 /* Instead of a voxel in a batch. */
@@ -801,6 +812,7 @@ typedef struct gphi_sums {
     double count;                       /* that V has seen */
     double q_bsdf, l_bsdf;              /* number and contributions of what the BSDF drew [eq. 14] */
     double q_guide, l_guide;            /* and of what the guide drew */
+    double flow;                        /* contributions / p of all these: what surfaces reflect */
     double v[GPHI_GATE], vv[GPHI_GATE]; /* sums of x_a = g^2 / (p p_a), and of x_a^2 */
     double cross[GPHI_GATE - 1];        /* of x_a x_1 */
 } gphi_sums;
@@ -825,6 +837,8 @@ typedef struct gphi_state {
     uint32_t probe;      /* closed: passes until the next try */
     uint32_t blocked;    /* found no memory: passing */
     float alpha;         /* learned */
+    float reflected;     /* mean of contribution / p when there were enough vertices last, 0 = there were not yet */
+    float chosen;        /* photons when the Gaussian's sigma was chosen; 0 = it is to be chosen */
 } gphi_state;
 
 /* A lit bin of a list, which is ordered by bin. */
@@ -968,6 +982,7 @@ static void gphi_halve(gphi_voxel *v, uint32_t bins)
     }
     v->s.photons *= 0.5;
     v->s.fresh /= 2;
+    v->s.chosen = 0; /* half as large, other light */
 }
 
 /* Give a voxel room for `more` entries. bytes: what that took. False: out of memory, nothing changed. */
@@ -1519,6 +1534,7 @@ static void gphi_vertex_add(gphi_sums *s, const gph_vertex *v, bool mapped)
     s->q_bsdf += v->strategy == GPH_FROM_BSDF;
     s->q_guide += v->strategy == GPH_FROM_GUIDE;
     *(v->strategy == GPH_FROM_BSDF ? &s->l_bsdf : &s->l_guide) += g;
+    s->flow += fmin(g / p, 1e30);
     if (!mapped || (g > 0 && !(v->pdf_guide > 0)))
         return;
     s->count += 1;
@@ -1823,10 +1839,31 @@ GPH_API gph_result gph_accumulate(gph_field *field, gph_stream *const *streams, 
 
 /* ---- >>cloud ------------------------------------------------------------------------------------------------ */
 
-static int gphi_ascending(const void *a, const void *b)
+/* The k-th smallest of n numbers, k < n; they are moved (Hoare's selection, the middle one as pivot). */
+static float gphi_select(float *x, uint32_t n, uint32_t k)
 {
-    float x = *(const float *)a, y = *(const float *)b;
-    return (x > y) - (x < y);
+    uint32_t low = 0, high = n - 1;
+    while (low < high) {
+        float pivot = x[low + (high - low) / 2];
+        uint32_t i = low, j = high;
+        for (;; ++i, --j) {
+            float t;
+            while (x[i] < pivot)
+                ++i;
+            while (x[j] > pivot)
+                --j;
+            if (i >= j)
+                break;
+            t = x[i];
+            x[i] = x[j];
+            x[j] = t;
+        }
+        if (k <= j) /* what is at or before j is at most the pivot, what follows at least */
+            high = j;
+        else
+            low = j + 1;
+    }
+    return x[k];
 }
 
 /* The photons of one leaf, as indices into the cloud. */
@@ -1839,14 +1876,17 @@ typedef struct gphi_group {
 /* Median of the photons' coordinates along an axis, the photon itself above it; false where all are the same. */
 static bool gphi_median(const gphi_group *g, const uint32_t *photons, uint32_t count, uint32_t axis, float *split)
 {
-    uint32_t i, at = count / 2;
-    for (i = 0; i < count; ++i)
+    float least = INFINITY, median, next = INFINITY; /* next: smallest that is more than the least */
+    uint32_t i;
+    for (i = 0; i < count; ++i) {
         g->numbers[i] = g->field->cloud[photons[i]].position[axis];
-    qsort(g->numbers, count, sizeof *g->numbers, gphi_ascending);
-    while (at < count && !(g->numbers[at] > g->numbers[0])) /* something must lie below */
-        ++at;
-    *split = at < count ? g->numbers[at] : 0;
-    return at < count;
+        least = g->numbers[i] < least ? g->numbers[i] : least;
+    }
+    for (i = 0; i < count; ++i)
+        next = g->numbers[i] > least && g->numbers[i] < next ? g->numbers[i] : next;
+    median = gphi_select(g->numbers, count, count / 2);
+    *split = median > least ? median : next; /* something must lie below */
+    return next < INFINITY;
 }
 
 /* Cut a leaf at the median of its photons, and its halves, while they have more than the threshold. */
@@ -2028,14 +2068,23 @@ static void gphi_verdict(const gph_desc *desc, gphi_state *s, gph_stats *stats)
     }
 }
 
+/* Fold the sums after a pass. Without a map nothing was guided: eq. 14 has nothing to compare, V neither. What surfaces
+   reflect is the same under any guide. */
+static void gphi_fold_pass(gphi_state *s)
+{
+    double seen;
+    gphi_fold(s, s->map == GPH_NONE ? 0 : 0.5);
+    seen = s->held.q_bsdf + s->held.q_guide;
+    if (seen >= GPHI_MIN_SEEN)
+        s->reflected = (float)fmin(s->held.flow / seen, 1e30); /* a loaded sum may be larger */
+}
+
 /* After a pass: fold the sums, learn alpha, judge. A closed voxel waits, then is tried anew. */
 static void gphi_judge(gph_field *f, gphi_state *s)
 {
-    if (s->map == GPH_NONE) { /* nothing guided: eq. 14 has nothing to compare, V neither */
-        gphi_fold(s, 0);
+    gphi_fold_pass(s);
+    if (s->map == GPH_NONE)
         return;
-    }
-    gphi_fold(s, 0.5);
     if (s->verdict == GPH_GATE_CLOSED) {
         s->probe -= s->probe > 0;
         if (!s->probe) {
@@ -2330,8 +2379,8 @@ static double gphi_likelihood(const gph_field *f, const gphi_voxel *v, float *ma
 
 #define GPHI_SIGMAS 8
 
-/* The likeliest sigma of the Gaussian: from the one chosen last up while that is likelier, else down. */
-static double gphi_choose_sigma(const gph_field *f, gphi_voxel *v, float *map, float *scratch)
+/* Blur a map by the likeliest sigma of the Gaussian: from the one chosen last up while that is likelier, else down. */
+static void gphi_blur_likeliest(const gph_field *f, gphi_voxel *v, float *map, float *scratch)
 {
     static const double sigmas[GPHI_SIGMAS] = {0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0};
     double best, sum = 0, scale = f->desc.rows / 32.0;
@@ -2339,7 +2388,12 @@ static double gphi_choose_sigma(const gph_field *f, gphi_voxel *v, float *map, f
     uint32_t i;
     for (i = 0; i < f->bins; ++i)
         sum += (double)map[i];
+    if (v->sigma && v->s.photons < 2 * (double)v->s.chosen) { /* it falls with a small root of the photons */
+        gphi_blur(map, scratch, (int)f->desc.rows, 2 * (int)f->desc.rows, sigmas[at] * scale);
+        return;
+    }
     best = gphi_likelihood(f, v, map, scratch, sum, sigmas[at] * scale);
+    memcpy(scratch + f->bins, map + f->bins, f->bins * sizeof *map);
     for (step = 1; step >= -1 && at == from; step -= 2)
         while (at + step >= 0 && at + step < GPHI_SIGMAS) {
             double likely = gphi_likelihood(f, v, map, scratch, sum, sigmas[at + step] * scale);
@@ -2347,9 +2401,11 @@ static double gphi_choose_sigma(const gph_field *f, gphi_voxel *v, float *map, f
                 break;
             best = likely;
             at += step;
+            memcpy(scratch + f->bins, map + f->bins, f->bins * sizeof *map);
         }
+    memcpy(map, scratch + f->bins, f->bins * sizeof *map);
     v->sigma = (uint32_t)at + 1;
-    return sigmas[at] * scale;
+    v->s.chosen = (float)v->s.photons;
 }
 
 /* Value of a coarse map [rows][columns] at the centre of bin (r, c) of the map twice as fine: linear interpolation. */
@@ -2417,8 +2473,10 @@ static void gphi_repair_map(const gph_field *f, gphi_voxel *v, float *map, float
         scratch[b.at] = *b.count_old || *b.count_now ? 1.0f : 0.0f;
     }
     if (f->desc.repair == GPH_REPAIR_GAUSSIAN) {
-        double sigma = f->desc.sigma > 0 ? (double)f->desc.sigma : gphi_choose_sigma(f, v, map, scratch);
-        gphi_blur(map, scratch, rows, columns, sigma);
+        if (f->desc.sigma > 0)
+            gphi_blur(map, scratch, rows, columns, (double)f->desc.sigma);
+        else
+            gphi_blur_likeliest(f, v, map, scratch);
     } else if (f->desc.repair == GPH_REPAIR_PYRAMID)
         gphi_pyramid(map, NULL, rows, columns, (int)f->desc.pyramid_levels);
     else if (f->desc.repair == GPH_REPAIR_PULL_PUSH)
@@ -2453,36 +2511,36 @@ static bool gphi_sum_weights(unsigned char *map, uint32_t rows, bool compare)
 {
     uint64_t *sums = (uint64_t *)(void *)map, *blocks = gphi_map_blocks(map, rows), sum = 0;
     const uint16_t *weights = gphi_map_weights(map, rows);
-    uint32_t i, bins = rows * rows * 2;
+    uint32_t i, k, bins = rows * rows * 2;
     bool same = true;
-    for (i = 0; i <= bins; ++i) {
-        uint64_t *to[2];
-        int k;
-        to[0] = i % (2 * rows) == 0 ? &sums[i / (2 * rows)] : NULL;
-        to[1] = i % 8 == 0 && i < bins ? &blocks[i / 8] : NULL;
-        for (k = 0; k < 2; ++k)
-            if (to[k]) {
-                same = same && *to[k] == sum;
-                *to[k] = compare ? *to[k] : sum;
-            }
-        sum += i < bins ? gph_weight(weights[i]) : 0;
+    for (i = 0; i < bins / 8; ++i) {
+        uint64_t *row = i % (rows / 4) == 0 ? &sums[i / (rows / 4)] : &blocks[i];
+        same = same && blocks[i] == sum && *row == sum;
+        if (!compare)
+            blocks[i] = *row = sum;
+        for (k = 0; k < 8; ++k)
+            sum += gph_weight(weights[8 * i + k]);
     }
-    return same && sum > 0;
+    same = same && sums[rows] == sum;
+    if (!compare)
+        sums[rows] = sum;
+    return (same || !compare) && sum > 0;
 }
 
 /* A map of values >= 0 as weights whose largest is 2^15, with their sums. False, and nothing written, without light. */
 static bool gphi_write_map(unsigned char *to, const float *map, uint32_t rows)
 {
     uint16_t *weights = gphi_map_weights(to, rows);
-    double most = 0, scale;
+    float most = 0;
+    double scale;
     uint32_t i, bins = rows * rows * 2;
     for (i = 0; i < bins; ++i)
-        most = (double)map[i] > most ? (double)map[i] : most;
+        most = map[i] > most ? map[i] : most;
     if (!(most > 0 && most < INFINITY))
         return false;
-    scale = 32768 / most;
+    scale = 32768 / (double)most;
     for (i = 0; i < bins; ++i)
-        weights[i] = map[i] > 0 ? gphi_half((float)fmin((double)map[i] * scale, 32768)) : 0;
+        weights[i] = map[i] > 0 ? gphi_half((float)((double)map[i] * scale)) : 0;
     memset(to + (rows + 1) * 8, 0, 56); /* between the sums of rows and of eights */
     gphi_sum_weights(to, rows, false);
     return true;
@@ -2560,6 +2618,7 @@ static void gphi_publish_maps(void *context, uint32_t begin, uint32_t end)
         gph_voxel *out = &gphi_block_voxels(p->block)[i];
         out->alpha = 1;
         out->photons = (float)v->s.photons;
+        out->reflected = v->s.reflected;
         out->level = (uint16_t)v->s.level;
         out->gate = (uint16_t)v->s.verdict;
         if (out->map == GPH_NONE)
@@ -2601,11 +2660,17 @@ static void gphi_publish_cubes(const gph_field *f, gphi_block *b)
     }
 }
 
+/* Whether all this, with so many bytes of sampling parts, is within 8 times the half-floats of all maps. */
+static bool gphi_lean(const gph_field *f, uint64_t parts)
+{
+    return gphi_held(f) - f->block_bytes - f->spare_bytes + parts <= 16 * (uint64_t)f->bins * f->mapped;
+}
+
 /* See that the spare block has room for `size` bytes, and not for many more. After the first refine a new one has a
-   quarter more where max_bytes allows: fresh memory is slow, zeroed by the system page by page. */
+   quarter more where there is room: fresh memory is slow, zeroed by the system page by page. */
 static bool gphi_spare_room(gph_field *f, uint64_t size)
 {
-    uint64_t bytes = f->stats.passes ? size + size / 4 : size;
+    uint64_t bytes = f->stats.passes && gphi_lean(f, size + size / 4) ? size + size / 4 : size;
     if (f->spare && size <= f->spare_bytes && f->spare_bytes / 2 <= bytes)
         return true;
     gphi_drop_spare(f);
@@ -2655,7 +2720,7 @@ static void gphi_swap_blocks(gph_field *f)
     f->block_bytes = f->spare_bytes;
     f->spare = old;
     f->spare_bytes = bytes;
-    if (bytes / 2 > f->block->size + f->block->size / 4)
+    if (bytes / 2 > f->block->size + f->block->size / 4 || !gphi_lean(f, f->block_bytes + f->spare_bytes))
         gphi_drop_spare(f);
 }
 
@@ -2767,10 +2832,15 @@ GPH_API gph_result gph_refine(gph_field *field, gph_parallel_fn parallel, void *
 
 GPH_API bool gph_all_closed(const gph_field *field) { return field->guiding == 0; }
 
-GPH_API bool gph_takes_photons(const gph_field *field, const float position[3])
+GPH_API double gph_photons_at(const gph_field *field, const float position[3])
 {
     uint32_t voxel = gphi_find(field, position);
-    return voxel != GPH_NONE && field->voxels[voxel].s.valid;
+    return voxel != GPH_NONE && field->voxels[voxel].s.valid ? field->voxels[voxel].s.photons : -1;
+}
+
+GPH_API bool gph_takes_photons(const gph_field *field, const float position[3])
+{
+    return gph_photons_at(field, position) >= 0;
 }
 
 GPH_API void gph_get_stats(const gph_field *field, gph_stats *stats)
@@ -3238,7 +3308,8 @@ static bool gphi_voxel_valid(const gph_field *f, const gphi_voxel *v)
     if (!gphi_sums_valid(&v->s.now) || !gphi_sums_valid(&v->s.held) || !(v->s.photons >= 0 && v->s.photons < 1e30) ||
         v->s.valid > 1 || v->s.rolled > f->stats.passes || (v->s.map != GPH_NONE && v->s.map >= f->block->maps) ||
         v->s.changed > 3 || v->sigma > GPHI_SIGMAS || v->s.verdict > GPH_GATE_CLOSED ||
-        !gphi_within_float(v->s.alpha, 0.04f, 1))
+        !gphi_within_float(v->s.alpha, 0.04f, 1) || !gphi_within_float(v->s.reflected, 0, 1e30f) ||
+        !gphi_within_float(v->s.chosen, 0, 1e30f))
         return false;
     for (i = 0; i < n; ++i) {
         gphi_bin b = gphi_get_bin(v, f->bins, i);
@@ -3331,7 +3402,7 @@ static gph_result gphi_block_valid(const gph_field *f)
     for (i = 0; ok && i < b->voxels; ++i) {
         const gph_voxel *v = &gphi_block_voxels(b)[i];
         ok = t.seen[i] && (v->map == GPH_NONE || v->map < b->maps) && gphi_within_float(v->alpha, 0.04f, 1) &&
-             v->gate <= GPH_GATE_CLOSED && v->level <= 24;
+             gphi_within_float(v->reflected, 0, 1e30f) && v->gate <= GPH_GATE_CLOSED && v->level <= 24;
     }
     for (i = 0; ok && i < b->maps; ++i)
         ok = gphi_map_valid(gphi_block_map(b, i), f->desc.rows);

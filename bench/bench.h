@@ -5,6 +5,8 @@
 
 #include "statistics.h"
 
+#include <math.h>
+#include <stdbool.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -269,6 +271,65 @@ static inline void bench_print_machine(FILE *json)
                 "\"fma_gflops\": %.1f, \"copy_ms\": %.3f, \"read_gb_s\": %.1f, \"load_ns\": [%.1f, %.1f, %.1f]},\n"
                 "\"rows\": [",
                 cpu, compiler, flags ? flags : "", commit ? commit : "", fma, copy, read, small, middle, large);
+}
+
+/* ---- rows of a table, on screen and as JSON */
+
+static FILE *bench_json;
+static int bench_json_rows;
+
+/* limit and naive in ns, 0 = none; target 0 = none. */
+static inline void bench_row(const char *name, bench_time t, double limit, double naive, double target)
+{
+    printf("%-44s %8.2f %8.2f %5.0f%% %8.2f %6.2fx", name, t.min, t.median, 100 * t.spread, limit, t.min / limit);
+    if (naive > 0)
+        printf(" %8.1f %6.2fx", naive, naive / t.min);
+    else
+        printf(" %8s %7s", "-", "-");
+    if (target > 0)
+        printf("   <= %.1f %s", target, t.min <= target ? "reached" : "missed");
+    printf("\n");
+    if (bench_json)
+        fprintf(bench_json,
+                "%s\n  {\"name\": \"%s\", \"ns\": %.2f, \"median_ns\": %.2f, \"spread\": %.3f, \"limit_ns\": %.2f, "
+                "\"naive_ns\": %.2f, \"target_ns\": %.1f}",
+                bench_json_rows++ ? "," : "", name, t.min, t.median, t.spread, limit, naive, target);
+}
+
+static inline void bench_row_titles(const char *what)
+{
+    printf("\n%-44s %8s %8s %6s %8s %7s %8s %7s   target\n", what, "min", "median", "spread", "limit", "ratio", "naive",
+           "faster");
+}
+
+static inline double bench_unit(uint64_t *state) { return (double)(bench_random(state) >> 11) * 0x1p-53; }
+
+static inline void bench_direction(uint64_t *state, float *d)
+{
+    double z = 1 - 2 * bench_unit(state), phi = 6.283185307179586 * bench_unit(state), r = sqrt(1 - z * z);
+    d[0] = (float)(r * cos(phi));
+    d[1] = (float)(r * sin(phi));
+    d[2] = (float)z;
+}
+
+/* --quick and --json FILE, which it opens. False: others, or the file cannot be written. */
+static inline bool bench_options(int argc, char **argv, bool *quick)
+{
+    *quick = false;
+    for (int i = 1; i < argc; ++i)
+        if (!strcmp(argv[i], "--quick"))
+            *quick = true;
+        else if (strcmp(argv[i], "--json") || i + 1 >= argc || !(bench_json = fopen(argv[++i], "w")))
+            return false;
+    return true;
+}
+
+static inline void bench_close_json(void)
+{
+    if (!bench_json)
+        return;
+    fprintf(bench_json, "\n]}\n");
+    fclose(bench_json);
 }
 
 #endif

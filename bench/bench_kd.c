@@ -18,8 +18,6 @@
     12 /* multiply-adds that a lobe's density takes at least: 4 for the exponent, 7 for exp2, 1 to add up */
 
 static int repeats = 12;
-static FILE *json_file;
-static int json_rows;
 
 static void fail(const char *what)
 {
@@ -43,41 +41,7 @@ static void *allocate(size_t count, size_t size)
     return p;
 }
 
-/* limit and naive in ns, 0 = none; target 0 = none. */
-static void row(const char *name, bench_time t, double limit, double naive, double target)
-{
-    printf("%-44s %8.2f %8.2f %5.0f%% %8.2f %6.2fx", name, t.min, t.median, 100 * t.spread, limit, t.min / limit);
-    if (naive > 0)
-        printf(" %8.1f %6.2fx", naive, naive / t.min);
-    else
-        printf(" %8s %7s", "-", "-");
-    if (target > 0)
-        printf("   <= %.1f %s", target, t.min <= target ? "reached" : "missed");
-    printf("\n");
-    if (json_file)
-        fprintf(json_file,
-                "%s\n  {\"name\": \"%s\", \"ns\": %.2f, \"median_ns\": %.2f, \"spread\": %.3f, \"limit_ns\": %.2f, "
-                "\"naive_ns\": %.2f, \"target_ns\": %.1f}",
-                json_rows++ ? "," : "", name, t.min, t.median, t.spread, limit, naive, target);
-}
-
-static void row_titles(const char *what)
-{
-    printf("\n%-44s %8s %8s %6s %8s %7s %8s %7s   target\n", what, "min", "median", "spread", "limit", "ratio", "naive",
-           "faster");
-}
-
 /* ---- mixtures ----------------------------------------------------------------------------------------------- */
-
-static double unit(uint64_t *seed) { return (double)(bench_random(seed) >> 11) * 0x1p-53; }
-
-static void random_direction(uint64_t *seed, float *d)
-{
-    double z = 1 - 2 * unit(seed), phi = 6.283185307179586 * unit(seed), r = sqrt(1 - z * z);
-    d[0] = (float)(r * cos(phi));
-    d[1] = (float)(r * sin(phi));
-    d[2] = (float)z;
-}
 
 /* As the definition has it: weight kappa / (2 pi (1 - exp(-2 kappa))) exp(kappa (mean . w - 1)). */
 static double naive_pdf(const gkd_lobe *lobes, double uniform, const float *w)
@@ -105,8 +69,8 @@ static void make_mixtures(mixtures *m)
     for (int i = 0; i < MIXTURES; ++i) {
         for (int k = 0; k < LOBES; ++k) {
             gkd_lobe *l = &m->lobes[i][k];
-            random_direction(&seed, l->mean);
-            l->kappa = (float)exp(log(1e3) * unit(&seed));
+            bench_direction(&seed, l->mean);
+            l->kappa = (float)exp(log(1e3) * bench_unit(&seed));
             l->weight = 1.0f / LOBES;
             l->nearness = 0;
         }
@@ -114,7 +78,7 @@ static void make_mixtures(mixtures *m)
         gkd_orient_lobes(&m->handles[i], m->lobes[i], LOBES, here, here, NULL);
     }
     for (int i = 0; i < DIRECTIONS; ++i) {
-        random_direction(&seed, m->directions[i]);
+        bench_direction(&seed, m->directions[i]);
         gkd_copy_handle(&m->spread[i], &m->handles[i % MIXTURES]);
     }
 }
@@ -158,9 +122,9 @@ static void bench_mixtures(const gkd_view *view)
         gkd_pdf_batch(view, DIRECTIONS, NULL, m->spread, m->directions[0], sizeof m->directions[0], m->pdf);
         bench_use(m->pdf);
     });
-    row_titles("ns per density");
-    row("pdf of one mixture of 8 lobes", same, limit, naive, 1.5);
-    row("pdf of random mixtures of 8 lobes", random, limit, naive, 4);
+    bench_row_titles("ns per density");
+    bench_row("pdf of one mixture of 8 lobes", same, limit, naive, 1.5);
+    bench_row("pdf of random mixtures of 8 lobes", random, limit, naive, 4);
     free(m);
 }
 
@@ -251,14 +215,14 @@ static void bench_queries(const gkd_view *view, queries *q)
     double limit = QUERY_LINES * bench_load_throughput((size_t)1 << 18), naive;
     gkd_view scalar = *view;
     scalar.simd = GKD_SIMD_SCALAR;
-    row_titles("ns per query: find, sample, another pdf");
+    bench_row_titles("ns per query: find, sample, another pdf");
     for (int normals = 0; normals < 2; ++normals) {
         bench_time batched, single;
         BENCH_MIN_NS(naive, 3, DIRECTIONS, query_singly(&scalar, q, normals););
         BENCH_TIME(batched, repeats, DIRECTIONS, query_all(view, q, normals););
         BENCH_TIME(single, repeats, DIRECTIONS, query_singly(view, q, normals););
-        row(normals ? "query, batched, with the cosine" : "query, batched", batched, limit, naive, 100);
-        row(normals ? "query, single, with the cosine" : "query, single", single, limit, naive, 200);
+        bench_row(normals ? "query, batched, with the cosine" : "query, batched", batched, limit, naive, 100);
+        bench_row(normals ? "query, single, with the cosine" : "query, single", single, limit, naive, 200);
     }
 }
 
@@ -287,31 +251,26 @@ static void bench_field(bool quick)
     printf("\nSF1: %u cells, %.1f lobes each, %.0f bytes a cell in both parts, %llu lookahead cells\n", stats.cells,
            (double)stats.lobes / stats.cells, (double)stats.bytes / stats.cells, (unsigned long long)stats.lookahead);
     bench_queries(&view, q);
-    row_titles("ns per sample");
+    bench_row_titles("ns per sample");
     int times = quick ? 1 : 5, log2n = quick ? 16 : 20;
     desc.split = GKD_SPLIT_SIGNATURE;
-    row("record + accumulate + refine, signatures", time_learning(&desc, log2n, times), QUERY_LINES * load, 0, 130);
+    bench_row("record + accumulate + refine, signatures", time_learning(&desc, log2n, times), QUERY_LINES * load, 0,
+              130);
     desc.split = GKD_SPLIT_COUNT;
-    row("record + accumulate + refine, count", time_learning(&desc, log2n, times), QUERY_LINES * load, 0, 130);
+    bench_row("record + accumulate + refine, count", time_learning(&desc, log2n, times), QUERY_LINES * load, 0, 130);
     desc.no_mixtures = true;
-    row("the same, without mixtures", time_learning(&desc, log2n, times), QUERY_LINES * load, 0, 0);
+    bench_row("the same, without mixtures", time_learning(&desc, log2n, times), QUERY_LINES * load, 0, 0);
     gkd_destroy(field);
     free(q);
 }
 
 int main(int argc, char **argv)
 {
-    bool quick = false;
-    for (int i = 1; i < argc; ++i)
-        if (!strcmp(argv[i], "--quick"))
-            quick = true;
-        else if (!strcmp(argv[i], "--json") && i + 1 < argc) {
-            if (!(json_file = fopen(argv[++i], "w")))
-                fail("cannot write the JSON file");
-        } else
-            fail("unknown option, or its value is missing; the first lines of bench_kd.c list them");
+    bool quick;
+    if (!bench_options(argc, argv, &quick))
+        fail("unknown option, or its value is missing or cannot be written; the first lines of bench_kd.c list them");
     repeats = quick ? 2 : 12;
-    bench_print_machine(json_file);
+    bench_print_machine(bench_json);
     gkd_desc desc;
     gkd_field *field;
     memset(&desc, 0, sizeof desc);
@@ -320,9 +279,6 @@ int main(int argc, char **argv)
     bench_mixtures(&view);
     gkd_destroy(field);
     bench_field(quick);
-    if (json_file) {
-        fprintf(json_file, "\n]}\n");
-        fclose(json_file);
-    }
+    bench_close_json();
     return 0;
 }

@@ -693,12 +693,12 @@ static void test_sizes_are_as_documented(void **state)
     (void)state;
     assert_int_equal(sizeof(gph_vertex), 32);
     assert_int_equal(sizeof(gph_photon), 28);
-    assert_int_equal(sizeof(gph_voxel), 16);
+    assert_int_equal(sizeof(gph_voxel), 20);
     assert_int_equal(sizeof(gph_node), 8);
-    assert_int_equal(sizeof(gphi_voxel), 336);
+    assert_int_equal(sizeof(gphi_voxel), 360);
     assert_int_equal(sizeof(gphi_entry), 16);
     assert_int_equal(sizeof(gphi_cloud_photon), 24);
-    assert_true(sizeof(gph_handle) <= 80);
+    assert_true(sizeof(gph_handle) <= 88);
     assert_int_equal(sizeof(gph_stats) % 8, 0);
     for (uint32_t rows = 16; rows <= 64; rows *= 2) { /* the sampling side is within twice the half-floats */
         gph_desc d = unit_cube();
@@ -894,6 +894,26 @@ static void test_first_pass_is_cut_at_the_median(void **state)
     gph_destroy(f);
 }
 
+/* Against sorting, with many that are equal. */
+static void test_selection_finds_what_sorting_finds(void **state)
+{
+    (void)state;
+    seed(43);
+    for (int i = 0; i < 3000; ++i) {
+        enum { MOST = 70 };
+        float x[MOST], sorted[MOST];
+        uint32_t n = 1 + (uint32_t)(rnd() * MOST) % MOST, k = (uint32_t)(rnd() * n) % n, values = 1 + (uint32_t)i % 9;
+        for (uint32_t j = 0; j < n; ++j) {
+            uint32_t at = j;
+            x[j] = i % 3 ? (float)((uint32_t)(rnd() * 9) % values) : rndf();
+            for (; at > 0 && sorted[at - 1] > x[j]; --at)
+                sorted[at] = sorted[at - 1];
+            sorted[at] = x[j];
+        }
+        assert_true(gphi_select(x, n, k) == sorted[k]);
+    }
+}
+
 static void test_later_passes_are_cut_in_the_middle_and_halves_inherit(void **state)
 {
     (void)state;
@@ -1014,6 +1034,16 @@ static void test_memory_of_a_voxel_is_bounded(void **state)
                 assert_true(s.sparse == VOXELS && building <= 2 * 16 * counts[i] + 128);
             else
                 assert_true(s.sparse == 0 && building == 12.0 * f->bins);
+            for (int pass = 1; pass < 5; ++pass) { /* what refine keeps for the next time is within that too */
+                for (int k = 0; k < VOXELS; ++k) {
+                    p[0] = ((float)k + 0.5f) / VOXELS;
+                    gph_vertex v = touch(p);
+                    gph_photon q = gph_make_photon(p, mean_a, 1, 1);
+                    learn(f, &v, 1, &q, counts[i] > 0);
+                }
+                OK(gph_refine(f, NULL, NULL));
+                assert_true((double)(c.bytes - empty) / VOXELS <= 8 * (double)half);
+            }
             gph_destroy(f);
             assert_int_equal(c.live, 0);
         }
@@ -1650,6 +1680,41 @@ static void test_gate_closes_where_guiding_does_not_pay_and_opens_where_it_does(
     gph_destroy(f);
 }
 
+/* Contribution / p is 2 g where p is a half, 0.5 g where it is two: its mean is known. With and without a map; too few
+   vertices say nothing, and passes without any forget nothing. */
+static void test_handles_tell_what_surfaces_reflect(void **state)
+{
+    (void)state;
+    gph_desc d = unit_cube();
+    gph_field *f;
+    float p[3] = {0.1f, 0.1f, 0.1f}, far[3] = {0.9f, 0.1f, 0.1f};
+    gph_stream *s;
+    OK(gph_create(&d, &f));
+    OK(gph_stream_create(f, &s));
+    for (int pass = 0; pass < 5; ++pass) {
+        for (int i = 0; i < (pass == 0 ? 30 : pass < 4 ? 40 : 0); ++i) {
+            gph_vertex v = gph_make_vertex(p, (float)(i % 2 ? 4 : 3), i % 4 < 2 ? 0.5f : 2, 1, 0, GPH_FROM_BSDF);
+            OK(gph_record_vertices(s, &v, 1));
+            v = touch(p);
+            OK(gph_record_vertices(s, &v, 1));
+            v = touch(far);
+            OK(gph_record_vertices(s, &v, 1));
+        }
+        if (pass == 2)
+            learn_at(f, p, 100);
+        OK(gph_accumulate(f, &s, 1, NULL, NULL));
+        gph_stream_clear(s);
+        OK(gph_refine(f, NULL, NULL));
+        OK(gph_validate(f));
+        gph_handle h = find(f, p);
+        assert_float_equal(h.reflected, pass ? 3.5 * 1.25 : 0, 1e-5);
+        assert_true((h.weights != NULL) == (pass >= 2));
+        assert_float_equal(find(f, far).reflected, 0, 0); /* nobody has looked on from there */
+    }
+    gph_stream_destroy(s);
+    gph_destroy(f);
+}
+
 static void test_ratio_alpha_is_equation_14(void **state)
 {
     (void)state;
@@ -1767,6 +1832,7 @@ int main(void)
         cmocka_unit_test(test_only_places_of_camera_paths_take_photons),
         cmocka_unit_test(test_first_vertices_give_the_box),
         cmocka_unit_test(test_first_pass_is_cut_at_the_median),
+        cmocka_unit_test(test_selection_finds_what_sorting_finds),
         cmocka_unit_test(test_later_passes_are_cut_in_the_middle_and_halves_inherit),
         cmocka_unit_test(test_unread_voxels_are_recycled),
         cmocka_unit_test(test_memory_of_a_voxel_is_bounded),
@@ -1784,6 +1850,7 @@ int main(void)
         cmocka_unit_test(test_a_failed_refine_can_be_repeated),
         cmocka_unit_test(test_queries_do_not_allocate_and_lost_samples_are_counted),
         cmocka_unit_test(test_gate_closes_where_guiding_does_not_pay_and_opens_where_it_does),
+        cmocka_unit_test(test_handles_tell_what_surfaces_reflect),
         cmocka_unit_test(test_ratio_alpha_is_equation_14),
         cmocka_unit_test(test_maps_go_out_and_come_back),
     };

@@ -3,13 +3,14 @@
    the receiver.
 
      >>rig >>shapes >>count >>camera >>lights >>power >>transport >>energy >>records >>identical
-     >>adjoint >>method >>misuse */
+     >>emission >>adjoint >>method >>misuse */
 #include "cmocka_prelude.h"
 
 #include <stdlib.h>
 #include <string.h>
 
 #include "bsdf_micro.h"
+#include "emission.h"
 #include "scene_internal.h"
 #include "threads.h"
 
@@ -159,9 +160,12 @@ static bool count(void *user, int tile, const tr_photon *photons, int n)
     return true;
 }
 
+static const tr_emission_map *the_emission; /* of all passes; NULL: even */
+
 static tr_photon_pass pass_of(const tr_scene *s, uint32_t paths, int depth, bool nee)
 {
     tr_photon_pass p = {.scene = s, .seed = 1, .total = paths, .count = paths, .max_depth = depth, .nee = nee};
+    p.emission = the_emission;
     return p;
 }
 
@@ -1033,6 +1037,159 @@ static void photons_are_identical_for_any_threads(void **state)
     tr_scene_free(s);
 }
 
+/* ---- >>emission --------------------------------------------------------------------------------------------- */
+
+/* In a box of 1/8 x 1/4 of the numbers all is of use, elsewhere one in 50. */
+static bool of_use(const float u[5], tr_rng *rng)
+{
+    return (u[1] >= 0.25f && u[1] < 0.375f && u[4] >= 0.75f) || rng_float(rng) < 0.02f;
+}
+
+static void random_numbers(tr_rng *rng, float u[5])
+{
+    for (int k = 0; k < 5; ++k)
+        u[k] = rng_float(rng);
+}
+
+/* Passes of an emission map that learns from of_use; more samples than it keeps. */
+static tr_emission_map *learned_map(int tiles)
+{
+    tr_emission_map *map = tr_emission_create(tiles);
+    tr_rng rng = rng_seed(5, 5);
+    assert_non_null(map);
+    assert_true(tr_emission_gain(map) == 1);
+    for (int pass = 0; pass < 6; ++pass) {
+        enum { N = 50000 };
+        for (int i = 0; i < N; ++i) {
+            float u[5], density;
+            random_numbers(&rng, u);
+            density = tr_emission_warp(map, u);
+            if (of_use(u, &rng))
+                assert_true(tr_emission_record(map, i * tiles / N, u, density, 1));
+        }
+        tr_emission_flush(map);
+        tr_emission_learn(map);
+    }
+    return map;
+}
+
+/* Warped numbers follow the density that comes with them: the mean of 1 / density over any box is its volume. */
+static void emission_map_is_a_density(void **state)
+{
+    (void)state;
+    tr_emission_map *map = learned_map(3), *other = learned_map(1);
+    tr_rng rng = rng_seed(6, 6);
+    double volume[5][4] = {{0}}, squares[5][4] = {{0}}, inside = 0;
+    enum { N = 200000 };
+    assert_true(tr_emission_gain(map) > 1.4);
+    for (int i = 0; i < N; ++i) {
+        float u[5], v[5], density;
+        random_numbers(&rng, u);
+        memcpy(v, u, sizeof v);
+        density = tr_emission_warp(map, u);
+        assert_true(density >= 0.2499f && density < 100);
+        assert_true(tr_emission_warp(other, v) == density); /* streams in one order: tiles do not matter */
+        assert_memory_equal(u, v, sizeof u);
+        for (int k = 0; k < 5; ++k) {
+            assert_true(u[k] >= 0 && u[k] < 1);
+            volume[k][(int)(4 * u[k])] += 1 / (double)density;
+            squares[k][(int)(4 * u[k])] += 1 / ((double)density * (double)density);
+        }
+        inside += u[1] >= 0.25f && u[1] < 0.375f && u[4] >= 0.75f;
+    }
+    for (int k = 0; k < 5; ++k)
+        for (int q = 0; q < 4; ++q) {
+            double mean = volume[k][q] / N, sigma = sqrt((squares[k][q] / N - mean * mean) / N);
+            if (!(fabs(mean - 0.25) < 4.5 * sigma))
+                fail_msg("axis %d, quarter %d: %g, sigma %g", k, q, mean, sigma);
+        }
+    /* The best density is as the root of how many are of use; a quarter stays even. */
+    double box = 1.0 / 32, rest = sqrt(0.02) * 31 / 32, best = 0.75 * box / (box + rest) + 0.25 / 32;
+    assert_true(fabs(inside / N - best) < 0.1 * best);
+    tr_emission_destroy(map);
+    tr_emission_destroy(other);
+    tr_emission_destroy(NULL);
+}
+
+/* Nothing is gained: the numbers stay as they are. */
+static void even_use_leaves_emission_even(void **state)
+{
+    (void)state;
+    tr_emission_map *map = tr_emission_create(1);
+    tr_rng rng = rng_seed(7, 7);
+    for (int pass = 0; pass < 4; ++pass) {
+        for (int i = 0; i < 20000; ++i) {
+            float u[5], v[5];
+            random_numbers(&rng, u);
+            memcpy(v, u, sizeof v);
+            assert_true(tr_emission_warp(map, u) == 1);
+            assert_memory_equal(u, v, sizeof u);
+            for (int hit = 0; hit < (i % 1000 ? 2 : 50); ++hit) /* a path that comes often is still one */
+                assert_true(tr_emission_record(map, 0, u, 1, i % 1000 ? 1 : 0.04f));
+        }
+        tr_emission_flush(map);
+        tr_emission_learn(map);
+    }
+    assert_true(tr_emission_gain(map) == 1);
+    tr_emission_destroy(map);
+}
+
+typedef struct learner {
+    tr_emission_map *map;
+    float half;
+} learner;
+
+static bool record_inside(void *user, int tile, const tr_photon *photons, int n)
+{
+    learner *l = user;
+    for (int i = 0; i < n; ++i)
+        if (fabsf(photons[i].p.y) < 1e-4f && fabsf(photons[i].p.x) < l->half && fabsf(photons[i].p.z) < l->half)
+            assert_true(tr_emission_record(l->map, tile, photons[i].u, photons[i].density, 1));
+    return true;
+}
+
+/* A lamp, a spot and the sun shine on a ball on a floor; what arrives on a small part of the floor is of use. Guided
+   passes bring the same flux there and on the whole floor, and there with less noise. */
+static void guided_emission_keeps_the_flux(void **state)
+{
+    (void)state;
+    tr_scene *s = scene_new();
+    learner l = {tr_emission_create(tr_photon_tiles(1 << 15)), 0.2f};
+    add_floor(s, 4);
+    add_sphere(s, GRAY, v3(0.6f, 0.4f, 0), 0.3f);
+    tr_shape *lamp = add_rectangle(s, GRAY, v3(1, 3, 0), 90, 0.5f, 0.5f);
+    shine(s, lamp, v3(4, 2, 1));
+    add_spot(s, v3(20, 30, 20), v3(0, 3, 1), v3(0, -1, -0.3f), 30, 10);
+    tr_light *sun = add_light(s, TR_LIGHT_SUN, v3(2000, 1500, 1000));
+    sun->direction = norm3(v3(0.3f, -1, 0.1f));
+    sun->cutoff_cos = 0.9999f;
+    scene_done(s);
+    assert_non_null(l.map);
+    for (int k = 0; k < 6; ++k) {
+        the_emission = l.map;
+        tr_photon_pass pass = pass_of(s, 1 << 15, 6, false);
+        pass.index = k;
+        pass.seed = 99;
+        assert_true(tr_trace_photons(&pass, record_inside, &l, NULL));
+        tr_emission_flush(l.map);
+        tr_emission_learn(l.map);
+    }
+    assert_true(tr_emission_gain(l.map) > 5);
+    receiver r[2] = {{.half = 0.2}, {.half = 4}};
+    for (int k = 0; k < 2; ++k) {
+        the_emission = NULL;
+        estimate even = photon_flux(s, r[k], 1 << 13, 6, false);
+        the_emission = l.map;
+        estimate guided = photon_flux(s, r[k], 1 << 13, 6, false);
+        check(k ? "guided, everywhere" : "guided, where it is of use", guided, even);
+        for (int c = 0; c < 3 && k == 0; ++c)
+            assert_true(guided.sigma[c] < 0.7 * even.sigma[c]);
+    }
+    the_emission = NULL;
+    tr_emission_destroy(l.map);
+    tr_scene_free(s);
+}
+
 /* ---- >>adjoint ---------------------------------------------------------------------------------------------- */
 
 static vec3 random_direction(tr_rng *rng)
@@ -1305,6 +1462,38 @@ static void the_picture_holds_the_flux(void **state)
     tr_scene_free(s);
 }
 
+/* The sun does not come into a closed room: after two passes photons are few and rare, and the picture is that of a
+   method that had none. */
+static void photons_of_no_use_are_given_up(void **state)
+{
+    (void)state;
+    tr_scene *s = scene_new();
+    add_room(s, GRAY);
+    shine(s, add_sphere(s, GRAY, v3(0, 1.5f, 0), 0.1f), v3s(1e-3f));
+    tr_light *sun = add_light(s, TR_LIGHT_DIRECTIONAL, v3s(1e6f));
+    sun->direction = norm3(v3(0.3f, -1, 0.2f));
+    scene_done(s);
+    s->camera.to_world = mat4_translate(v3(0, 1, -0.9f));
+    s->camera.fov = 60;
+    uint64_t paths[2];
+    for (int k = 0; k < 2; ++k) {
+        tr_option option = {.key = "budget", .value = k ? "on" : "off"};
+        tr_settings settings = {.width = 32, .height = 32, .spp = 64, .threads = 1, .options = &option};
+        tr_result result;
+        char err[256] = "";
+        settings.option_count = 1;
+        settings.method = tr_method_find("photon");
+        assert_true(tr_render(s, &settings, &result, err, sizeof err));
+        paths[k] = result.photon_paths;
+        const char *skipped = strstr(result.method.json, "\"skipped_photon_passes\": ");
+        assert_non_null(skipped);
+        assert_true(k ? atoi(skipped + 25) >= 3 : atoi(skipped + 25) == 0);
+        tr_result_free(&result);
+    }
+    assert_true(paths[0] > 8 * paths[1]);
+    tr_scene_free(s);
+}
+
 /* ---- >>misuse ----------------------------------------------------------------------------------------------- */
 
 static void check_nothing(tr_scene *s, uint32_t paths, int depth)
@@ -1445,9 +1634,13 @@ int main(void)
         cmocka_unit_test(distances_run_on_through_mirrors),
         cmocka_unit_test(distances_to_the_sky_are_infinite),
         cmocka_unit_test(photons_are_identical_for_any_threads),
+        cmocka_unit_test(emission_map_is_a_density),
+        cmocka_unit_test(even_use_leaves_emission_even),
+        cmocka_unit_test(guided_emission_keeps_the_flux),
         cmocka_unit_test(adjoint_is_the_way_back),
         cmocka_unit_test(smooth_glass_keeps_flux),
         cmocka_unit_test(passes_hand_photons_to_the_method),
+        cmocka_unit_test(photons_of_no_use_are_given_up),
         cmocka_unit_test(the_picture_holds_the_flux),
         cmocka_unit_test(no_light_no_photons),
         cmocka_unit_test(nothing_arrives_where_nothing_scatters),

@@ -471,7 +471,7 @@ static void same_for_threads(const char *method, int train)
     s.train = train;
     s.threads = 1;
     tr_result one = render(scene, &s);
-    assert_true(strcmp(method, "sdtree") != 0 || one.split_paths > 0);
+    assert_true(strcmp(method, "pt") == 0 || one.split_paths > 0);
     for (int threads = 2; threads <= 5; threads += 3) {
         s.threads = threads;
         tr_result many = render(scene, &s);

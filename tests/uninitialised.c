@@ -1,12 +1,13 @@
-/* uninitialised.c: learns small fields with guide_kd.h, asks them, trains and runs small networks of guide_nn.h, and
-   prints a hash of all of it. Built by uninitialised.sh with stack and heap filled with different bytes: the hash may
-   not depend on them. */
+/* uninitialised.c: learns small fields with guide_kd.h and guide_photon.h, asks them, trains and runs small networks of
+   guide_nn.h, and prints a hash of all of it. Built by uninitialised.sh with stack and heap filled with different bytes:
+   the hash may not depend on them. */
 #include <stdio.h>
 #include <stdlib.h>
 
 #define GKD_IMPLEMENTATION
 #include "guide_kd.h"
-
+#define GPH_IMPLEMENTATION
+#include "guide_photon.h"
 #define GNN_IMPLEMENTATION
 #include "guide_nn.h"
 
@@ -19,6 +20,7 @@
 enum { N = 12000, ASKED = 64 };
 static gkd_training_sample samples[N];
 static uint64_t hash = 1;
+static const float mean_up[3] = {0, 0, 1};
 
 static void *filled(void *user, size_t size)
 {
@@ -189,6 +191,127 @@ static bool train_nets(void)
     return good;
 }
 
+/* ---- photons */
+
+static gph_photon photons[N];
+static gph_vertex vertices[N];
+
+/* Two lights; camera paths see two thirds of the box, later ones half of it. */
+static void make_photons(const gph_view *v, int pass)
+{
+    for (int i = 0; i < N; ++i) {
+        float p[3] = {rndf(), rndf(), rndf()}, q[3] = {rndf(), rndf(), rndf()}, d[3], u[2] = {rndf(), rndf()}, pdf;
+        gph_handle h;
+        direction(d);
+        d[2] = i % 3 ? d[2] : 5;
+        photons[i] = gph_make_photon(q, d, i % 401 ? 1 : NAN, i % 5 ? rndf() : 0);
+        p[0] *= pass < 2 ? 0.67f : 0.5f;
+        gph_find(v, p, i % 2 ? mean_up : NULL, NULL, &h);
+        pdf = gph_sample(&h, u, d);
+        vertices[i] = gph_make_vertex(p, d[2] > 0.9f ? 10 : 0.1f, i % 307 ? pdf : 0, 0.3f, i % 7 ? pdf : 0,
+                                      i % 11 ? (uint32_t)i % 2 : GPH_TOUCH_ONLY);
+    }
+}
+
+static void ask_photons(const gph_view *v)
+{
+    static float p[ASKED][3], n[ASKED][3], u[ASKED][3], w[ASKED][3], pdf[ASKED], alpha[ASKED];
+    static gph_handle h[ASKED];
+    memset(h, FILL, sizeof h);
+    for (int i = 0; i < ASKED; ++i) {
+        for (int k = 0; k < 3; ++k) {
+            p[i][k] = rndf();
+            u[i][k] = rndf();
+        }
+        direction(n[i]);
+    }
+    gph_find_batch(v, ASKED, NULL, p[0], sizeof p[0], n[0], sizeof n[0], u[0], sizeof u[0], h, alpha);
+    gph_sample_batch(v, ASKED, NULL, h, u[0], sizeof u[0], w[0], sizeof w[0], pdf);
+    add(w, sizeof w);
+    add(pdf, sizeof pdf);
+    add(alpha, sizeof alpha);
+    for (int i = 0; i < ASKED; ++i)
+        add(&h[i].reflected, sizeof h[i].reflected);
+    gph_pdf_batch(v, ASKED, NULL, h, n[0], sizeof n[0], pdf);
+    add(pdf, sizeof pdf);
+}
+
+/* The voxels' histograms go out, and come back as maps. */
+static void exchange_maps(gph_field *f)
+{
+    uint32_t list[4], n = gph_changed_voxels(f, list, 4), bins = gph_get_desc(f)->rows * gph_get_desc(f)->rows * 2;
+    float *features = malloc(4 * GPH_FEATURES * bins * sizeof *features), seen[4];
+    if (!features)
+        exit(1);
+    n = n < 4 ? n : 4;
+    gph_export_maps(f, list, n, features, seen);
+    add(features, n * GPH_FEATURES * bins * sizeof *features);
+    add(seen, n * sizeof *seen);
+    for (uint32_t i = 1; i < n; ++i)
+        memmove(features + i * bins, features + i * GPH_FEATURES * bins, bins * sizeof *features);
+    gph_import_maps(f, list, n, features, NULL, NULL);
+    free(features);
+}
+
+static bool learn_photons(gph_field *f, int pass)
+{
+    gph_view v = gph_get_view(f);
+    gph_stream *stream;
+    size_t size, bound;
+    bool good;
+    make_photons(&v, pass);
+    if (gph_stream_create(f, &stream))
+        return false;
+    good = !gph_record_vertices(stream, vertices, N) && !gph_record_photons(stream, photons, N) &&
+           !gph_accumulate(f, &stream, 1, NULL, NULL);
+    gph_stream_destroy(stream);
+    for (int k = 0; k < 2 && good; ++k) { /* before refine, when the first pass's photons wait, and after */
+        void *data;
+        good = k == 0 || !gph_refine(f, NULL, NULL);
+        if (k == 1)
+            exchange_maps(f);
+        bound = gph_save_bound(f);
+        data = malloc(bound);
+        good = good && data && !gph_save(f, data, bound, &size) && !gph_validate(f);
+        if (good)
+            add(data, size);
+        free(data);
+    }
+    v = gph_get_view(f);
+    ask_photons(&v);
+    return good;
+}
+
+/* Every repair, and voxels that are recycled. */
+static bool photon_fields(void)
+{
+    for (int repair = GPH_REPAIR_NONE; repair < GPH_REPAIR_COUNT_; ++repair) {
+        gph_desc d;
+        gph_field *f;
+        gph_stats s;
+        memset(&d, 0, sizeof d);
+        d.bounds_max[0] = d.bounds_max[1] = d.bounds_max[2] = repair == GPH_REPAIR_NONE ? 0 : 1;
+        d.grid_cells = 3;
+        d.rows = repair == GPH_REPAIR_GAUSSIAN ? 32 : 16;
+        d.repair = (gph_repair)repair;
+        d.alpha_mode = repair == GPH_REPAIR_NONE ? GPH_ALPHA_RATIO : GPH_ALPHA_VARIANCE;
+        d.split_photons = 300;
+        d.keep_passes = 1;
+        d.allocate = filled;
+        d.release = release;
+        if (gph_create(&d, &f))
+            return false;
+        for (int pass = 0; pass < 4; ++pass)
+            if (!learn_photons(f, pass))
+                return false;
+        gph_get_stats(f, &s);
+        if (s.splits < 4 || s.recycled < 1 || s.maps < 9)
+            return false;
+        gph_destroy(f);
+    }
+    return true;
+}
+
 int main(void)
 {
     if (!train_nets())
@@ -214,6 +337,8 @@ int main(void)
             return 1;
         gkd_destroy(f);
     }
+    if (!photon_fields())
+        return 1;
     printf("%016llx\n", (unsigned long long)hash);
     return 0;
 }

@@ -7,21 +7,41 @@
    (what lies below the surface is mirrored up), jitter=on|off (find looks up a jittered position).
 
    A pass's photons are traced after its camera paths, which make voxels valid, also those that the refine before has
-   cut. While no voxel guides, only every fourth pass has some. */
+   cut. They start where earlier ones came to valid voxels (emission=on|off). How many there are follows from counted
+   work and from what became of those before (budget=on|off, off: `photons` for each camera path in every pass), see
+   >>budget. */
+#include "emission.h"
 #include "method_options.h"
 
 #define GPH_IMPLEMENTATION
 #include "guide_photon.h"
 
-#define IDLE_PASSES 4 /* between two passes with photons where no voxel guides */
+#define IDLE_PASSES 4     /* between two passes with photons where they are of no use */
+#define WORK_SHARE 0.75   /* photons' part of the work, as camera paths' part is 1 */
+#define MIN_YIELD 0.001   /* photons that valid voxels take, per path: below it they are of no use ... */
+#define PATIENCE 2        /* ... after so many passes */
+#define FEW_PHOTONS 32    /* in a voxel: the first ones say less than each is worth by 1 / M */
+#define PROBE_SHARE 0.125 /* of the paths, while they are of no use */
+
+/* What the last pass's photons cost and were good for; see >>budget. */
+typedef struct photon_budget {
+    double rate;              /* photon paths per camera path in the next pass */
+    uint64_t *handed;         /* photons handed over, by tile, in this pass */
+    uint64_t vertices, taken; /* that the field had counted before this pass */
+    uint32_t poor;            /* passes one after the other whose photons were of no use */
+    uint32_t passes, skipped; /* with photons; without, though there were some to learn from */
+    double yield;             /* photons taken per path, last pass */
+} photon_budget;
 
 typedef struct photon {
     gph_field *field;
     gph_view view;
     gph_stream **streams; /* of camera paths; those of photons follow */
     int tiles, photon_tiles;
-    bool surface, jitter;
-    double per_path, paths; /* photon paths per camera path; camera paths of one sample per pixel */
+    bool surface, jitter, adapts;
+    tr_emission_map *emission; /* NULL: even emission */
+    double per_path, paths;    /* photon paths per camera path; camera paths of one sample per pixel */
+    photon_budget budget;
     double flux; /* of a photon of this pass: its power times the pass's paths, so that all paths count alike */
     uint64_t stream_peak;
     tr_parallel_fn parallel;
@@ -36,6 +56,9 @@ static bool parse(parser *p, gph_desc *d, photon *m)
     m->per_path = number(p, "photons", 1);
     if (m->per_path > 16)
         complain(p, "photons", option(p->env, "photons"), "0 .. 16");
+    m->adapts = choice(p, "budget", "off|on") != 0;
+    if (choice(p, "emission", "off|on") != 0)
+        m->emission = tr_emission_create(m->photon_tiles);
     d->repair = (gph_repair)(choice(p, "repair", "none|gaussian|pyramid|pull_push") + 1);
     d->sigma = (float)number(p, "sigma", 0);
     d->pyramid_levels = whole(p, "pyramid_levels", 0);
@@ -68,6 +91,8 @@ static void photon_destroy(void *method)
         gph_stream_destroy(m->streams[i]);
     free(m->streams);
     gph_destroy(m->field);
+    tr_emission_destroy(m->emission);
+    free(m->budget.handed);
     free(m);
 }
 
@@ -103,7 +128,9 @@ static void *photon_create(tr_method_env *env, char *err, size_t err_size)
         return NULL;
     }
     m->view = gph_get_view(m->field);
-    return m;
+    m->budget.rate = m->per_path;
+    m->budget.handed = calloc((size_t)m->photon_tiles, sizeof *m->budget.handed);
+    return m->budget.handed ? m : (photon_destroy(m), NULL);
 }
 
 /* ---- passes */
@@ -114,16 +141,58 @@ static bool photon_begin_pass(void *method, const tr_pass *pass)
     return !pass->last;
 }
 
+/* ---- >>budget
+
+   Work is counted, not timed, so that pictures do not depend on the machine: a path and each of its vertices count one.
+   Photons get WORK_SHARE of what the pass's camera paths took, at most `photons` paths for each of those. Where valid
+   voxels take next to none of them (light that leaves the scene, or goes where no camera path comes), or where no voxel
+   guides, only every IDLE_PASSES-th pass has some, and few. */
+
 static uint64_t photon_wants_photons(void *method, const tr_pass *pass)
 {
     photon *m = method;
+    photon_budget *b = &m->budget;
+    double rate = m->adapts ? b->rate : m->per_path;
     gph_stats s;
     gph_get_stats(m->field, &s);
-    if (pass->last || (s.maps > 0 && gph_all_closed(m->field) && pass->index % IDLE_PASSES != 0))
+    bool closed = s.maps > 0 && gph_all_closed(m->field), useless = m->adapts && b->poor >= PATIENCE;
+    m->flux = 0;
+    if (pass->last)
         return 0;
-    m->flux = floor(m->per_path * m->paths * pass->spp + 0.5);
+    if ((closed || useless) && pass->index % IDLE_PASSES != 0) {
+        b->skipped += rate > 0;
+        return 0;
+    }
+    m->flux = floor((useless ? PROBE_SHARE : 1) * rate * m->paths * pass->spp + 0.5);
+    b->passes += m->flux > 0;
     return (uint64_t)m->flux;
 }
+
+/* After a pass: what its photons were good for, and how many the next one may have. */
+static void photon_judge(photon *m, const tr_pass *pass)
+{
+    photon_budget *b = &m->budget;
+    gph_stats s;
+    double handed = 0, camera = m->paths * pass->spp;
+    gph_get_stats(m->field, &s);
+    camera += (double)(s.vertices - b->vertices);
+    for (int i = 0; i < m->photon_tiles; ++i) {
+        handed += (double)b->handed[i];
+        b->handed[i] = 0;
+    }
+    if (m->flux > 0) {
+        double each = 1 + handed / m->flux; /* work of a path */
+        b->yield = (double)(s.photons - b->taken) / m->flux;
+        b->poor = b->yield < MIN_YIELD ? b->poor + 1 : 0;
+        b->rate = fmin(m->per_path, WORK_SHARE * camera / (m->paths * pass->spp) / each);
+    }
+    b->vertices = s.vertices;
+    b->taken = s.photons;
+}
+
+static const tr_emission_map *photon_emission(void *method) { return ((const photon *)method)->emission; }
+
+/* ---- records */
 
 static gph_vertex convert(const tr_vertex *v)
 {
@@ -155,6 +224,7 @@ static bool photon_record_photons(void *method, int tile, const tr_photon *photo
     photon *m = method;
     gph_photon samples[64];
     bool ok = true;
+    m->budget.handed[tile] += (uint64_t)n;
     for (int done = 0; done < n;) {
         int k = 0;
         for (; k < 64 && done < n; ++done) {
@@ -163,6 +233,9 @@ static bool photon_record_photons(void *method, int tile, const tr_photon *photo
             if (p->flags)
                 continue;
             memcpy(at, &p->p, sizeof at);
+            double known = m->emission ? gph_photons_at(m->field, at) : -1;
+            if (known >= 0)
+                ok = tr_emission_record(m->emission, tile, p->u, p->density, (float)(1 / (known + FEW_PHOTONS))) && ok;
             memcpy(from, &p->wi, sizeof from);
             samples[k++] = gph_make_photon(at, from, p->distance,
                                            (float)((double)((p->flux.x + p->flux.y + p->flux.z) / 3) * m->flux));
@@ -183,6 +256,8 @@ static void photon_flush(void *method)
     gph_accumulate(m->field, m->streams, (uint32_t)streams, m->parallel, m->parallel_user); /* losses: in the stats */
     for (int i = 0; i < streams; ++i)
         gph_stream_clear(m->streams[i]);
+    if (m->emission)
+        tr_emission_flush(m->emission);
 }
 
 static bool photon_end_pass(void *method, const tr_pass *pass)
@@ -193,6 +268,9 @@ static bool photon_end_pass(void *method, const tr_pass *pass)
     photon_flush(m);
     gph_result result = gph_refine(m->field, m->parallel, m->parallel_user);
     m->view = gph_get_view(m->field);
+    if (m->emission && m->flux > 0)
+        tr_emission_learn(m->emission);
+    photon_judge(m, pass);
     return !result;
 }
 
@@ -227,6 +305,14 @@ static void photon_pdf(void *method, int n, const int *index, const void *handle
     gph_pdf_batch(&m->view, (uint32_t)n, (const uint32_t *)index, handles, &wi->x, sizeof *wi, pdf);
 }
 
+static void photon_reflected(void *method, int n, const void *handles, float *radiance)
+{
+    const gph_handle *h = handles;
+    (void)method;
+    for (int i = 0; i < n; ++i)
+        radiance[i] = h[i].reflected;
+}
+
 /* ---- reports */
 
 /* Voxel number, and how many photons it has seen. */
@@ -257,12 +343,15 @@ static void photon_stats(void *method, tr_method_stats *stats)
              "\"cubes\": %u, \"maps\": %u, \"valid\": %u, \"sparse\": %u, \"levels\": %u, \"splits\": %llu, "
              "\"recycled\": %llu, \"built\": %llu, \"skipped\": %llu, \"open_voxels\": %u, \"closed_voxels\": %u, "
              "\"unjudged_voxels\": %u, \"opened\": %llu, \"closed\": %llu, \"probed\": %llu, \"closed_share\": %.4f, "
-             "\"mean_alpha\": %.4f, \"useful_share\": %.4f",
+             "\"mean_alpha\": %.4f, \"useful_share\": %.4f, \"photon_rate\": %.4f, \"photon_yield\": %.4f, "
+             "\"photon_passes\": %u, \"skipped_photon_passes\": %u, \"emission_gain\": %.2f",
              s.passes, (unsigned long long)s.clamped, (unsigned long long)s.lost, (unsigned long long)s.denied,
              (unsigned long long)s.photons, s.cubes, s.maps, s.valid, s.sparse, s.levels, (unsigned long long)s.splits,
              (unsigned long long)s.recycled, (unsigned long long)s.built, (unsigned long long)s.skipped, s.open_voxels,
              s.closed_voxels, s.unjudged_voxels, (unsigned long long)s.opened, (unsigned long long)s.closed,
-             (unsigned long long)s.probed, (double)s.closed_share, (double)s.mean_alpha, (double)s.useful_share);
+             (unsigned long long)s.probed, (double)s.closed_share, (double)s.mean_alpha, (double)s.useful_share,
+             m->budget.rate, m->budget.yield, m->budget.passes, m->budget.skipped,
+             m->emission ? tr_emission_gain(m->emission) : 1);
 }
 
 const tr_method tr_method_photon = {.name = "photon",
@@ -276,10 +365,13 @@ const tr_method tr_method_photon = {.name = "photon",
                                     .find = photon_find,
                                     .sample = photon_sample,
                                     .pdf = photon_pdf,
+                                    .reflected = photon_reflected,
                                     .record = photon_record,
                                     .wants_photons = photon_wants_photons,
+                                    .emission = photon_emission,
                                     .record_photons = photon_record_photons,
                                     .flush = photon_flush,
                                     .end_pass = photon_end_pass,
                                     .describe = photon_describe,
+                                    .wants_pixel_estimate = true,
                                     .stats = photon_stats};

@@ -100,6 +100,7 @@ static bool shoot_photons(render_state *r, const tr_pass *info)
     bool ok = true;
     for (uint64_t first = 0; ok && first < total; first += ROUND_PATHS) {
         tr_photon_pass pass = {.scene = r->frame.scene,
+                               .emission = m->emission ? m->emission(r->frame.method_data) : NULL,
                                .seed = r->settings->seed,
                                .index = info->index,
                                .total = total,

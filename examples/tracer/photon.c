@@ -8,6 +8,7 @@
 
    Every path has a generator of its own, seeded by its place in the pass, and a tile's photons come in one order: so
    the photons do not depend on the number of threads. */
+#include "emission.h"
 #include "integrator.h"
 
 #include <stdlib.h>
@@ -20,6 +21,7 @@ typedef struct photon_path {
     vec3 origin, direction, flux;
     float first_flux; /* largest channel when it left the light: roulette holds it there */
     float distance;   /* from the last vertex that was not delta */
+    float u[5], density;
     int bounces;
     bool delta_light, unseen;
 } photon_path;
@@ -51,14 +53,15 @@ static void emit(photon_worker *w, const tr_photon_pass *pass, uint64_t first, i
     for (int i = 0; i < count; ++i) {
         photon_path *p = &w->paths[i];
         tr_emission e;
-        float u[5];
+        float *u = p->u;
         p->rng = rng_seed(seed, first + (uint64_t)i);
         u[0] = rng_float(&p->rng);
         rng_float2(&p->rng, &u[1], &u[2]);
         rng_float2(&p->rng, &u[3], &u[4]);
+        p->density = tr_emission_warp(pass->emission, u);
         if (!tr_light_emit(pass->scene, u, &e))
             continue;
-        p->flux = scale3(e.flux, share);
+        p->flux = scale3(e.flux, share / p->density);
         p->first_flux = max3(p->flux);
         p->direction = e.direction;
         p->origin = black3(e.ng) ? e.p : tr_leave_surface(pass->scene, e.p, e.ng, e.direction);
@@ -129,6 +132,8 @@ static bool deposit(photon_worker *w, bool nee, int tile, tr_photon_fn take, voi
         out->ng = s->ng;
         out->ns = w->closures[id].frame.n;
         out->bounces = p->bounces;
+        memcpy(out->u, p->u, sizeof out->u);
+        out->density = p->density;
         out->flags = (nee && p->bounces == 0 ? TR_PHOTON_DIRECT : 0) | (p->unseen ? TR_PHOTON_UNSEEN : 0);
     }
     stats->photons += (uint64_t)n;

@@ -473,15 +473,20 @@ typedef struct tr_photon {
     vec3 ng, ns;    /* at p; ns as the bsdf turned it */
     int bounces;    /* surfaces it has left before, delta ones too */
     uint32_t flags; /* TR_PHOTON_..., 0 = what a guided direction from p can find */
+    float u[5];     /* that tr_light_emit made its path's start of */
+    float density;  /* of them, see emission.h; 1 = even */
 } tr_photon;
 #define TR_PHOTON_DIRECT 1u /* straight from a light, which next event estimation samples */
 /* Light that no camera path gathers: a point's, spot's or directional light's through glass or mirrors, or any of
    theirs without next event estimation. */
 #define TR_PHOTON_UNSEEN 2u
 
+typedef struct tr_emission_map tr_emission_map;
+
 /* Photon paths first .. first + count - 1 of pass `index`, whose paths are `total`. */
 typedef struct tr_photon_pass {
     const tr_scene *scene;
+    const tr_emission_map *emission; /* NULL = even */
     uint64_t seed;
     int index;
     uint64_t total, first;
@@ -601,6 +606,7 @@ typedef struct tr_method {
     /* Photon paths to trace after this pass's camera paths have been taken in, before end_pass; 0 = none. Asked only
        where end_pass follows. */
     uint64_t (*wants_photons)(void *method, const tr_pass *pass);
+    const tr_emission_map *(*emission)(void *method); /* where these paths start, see emission.h */
     /* A tr_photon_fn: streams like record's, taken in by flush. */
     bool (*record_photons)(void *method, int tile, const tr_photon *photons, int n);
     void (*stats)(void *method, tr_method_stats *stats);
