@@ -10,16 +10,11 @@
 #include <string.h>
 
 #include "bsdf_micro.h"
+#include "scale.h"
 #include "scene_internal.h"
 #include "threads.h"
 
 #define PI 3.14159265358979323846
-
-#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-#define LESS(n) ((n) / 8)
-#else
-#define LESS(n) (n)
-#endif
 
 /* ---- >>rig -------------------------------------------------------------------------------------------------- */
 
