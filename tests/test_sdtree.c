@@ -10,7 +10,6 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <unistd.h>
 
 #define GSD_IMPLEMENTATION
 #include "guide_sdtree.h"
@@ -197,39 +196,6 @@ static void test_documented_defaults_are_the_defaults(void **state)
     assert_int_equal(d.spatial_filter, GSD_SPATIAL_NEAREST);
     assert_int_equal(d.directional_filter, GSD_DIRECTIONAL_BOX);
     assert_int_equal(d.alpha_mode, GSD_ALPHA_GRID);
-}
-
-/* The example in the opening comment compiles as it stands, and runs. */
-static void test_the_example_in_the_comment_compiles(void **state)
-{
-    (void)state;
-    FILE *f = fopen("guide_sdtree.h", "r");
-    const char *root = f ? "." : "..";
-    char line[512], command[1024], source[80], program[64];
-    int lines = 0;
-    f = f ? f : fopen("../guide_sdtree.h", "r");
-    assert_non_null(f);
-    snprintf(program, sizeof program, "/tmp/gsd_example_%ld", (long)getpid());
-    snprintf(source, sizeof source, "%s.c", program);
-    FILE *out = fopen(source, "w");
-    assert_non_null(out);
-    while (fgets(line, sizeof line, f)) {
-        if (!lines && strncmp(line, "       #define GSD_IMPLEMENTATION", 33) != 0)
-            continue;
-        if (strncmp(line, "       ", 7) != 0)
-            break;
-        fputs(line + 7, out);
-        lines++;
-    }
-    fclose(f);
-    fclose(out);
-    assert_true(lines >= 15 && lines <= 25);
-    snprintf(command, sizeof command, "%s -std=c99 -Wall -Wextra -Werror -I%s %s -o %s -lm && %s",
-             getenv("CC") ? getenv("CC") : "cc", root, source, program, program);
-    int status = system(command);
-    remove(source);
-    remove(program);
-    assert_int_equal(status, 0);
 }
 
 static void test_bad_descriptors_are_refused_by_name(void **state)
@@ -3038,7 +3004,6 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(test_documented_defaults_are_the_defaults),
-        cmocka_unit_test(test_the_example_in_the_comment_compiles),
         cmocka_unit_test(test_bad_descriptors_are_refused_by_name),
         cmocka_unit_test(test_sizes_are_as_documented),
         cmocka_unit_test(test_pdf_integrates_to_one),
