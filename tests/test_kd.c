@@ -23,21 +23,6 @@
 
 /* ---- helpers */
 
-static void random_direction(float d[3])
-{
-    double z = 2 * rnd() - 1, phi = 2 * PI * rnd(), r = sqrt(1 - z * z);
-    d[0] = (float)(r * cos(phi));
-    d[1] = (float)(r * sin(phi));
-    d[2] = (float)z;
-}
-
-static void count_with(gkd_desc *d, counter *c)
-{
-    d->allocate = count_allocate;
-    d->release = count_release;
-    d->user = c;
-}
-
 /* The levels that this machine has, from the plainest up. */
 static uint32_t levels_here(gkd_simd out[5])
 {

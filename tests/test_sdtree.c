@@ -23,14 +23,6 @@
 
 /* ---- helpers */
 
-static void random_direction(float d[3])
-{
-    double z = 2 * rnd() - 1, phi = 2 * PI * rnd(), r = sqrt(1 - z * z);
-    d[0] = (float)(r * cos(phi));
-    d[1] = (float)(r * sin(phi));
-    d[2] = (float)z;
-}
-
 static long scaled(long n) { return getenv("GUIDE_TEST_LONG") ? 10 * n : n; }
 
 #define OK(call) assert_int_equal((call), GSD_OK)
@@ -2089,7 +2081,7 @@ static int scenario(counter *c)
     d.forest_cells = 3;
     d.alias = true;
     d.target = GSD_TARGET_SIMPLE;
-    use_counter(&d, c);
+    count_with(&d, c);
     seed(1);
     if (gsd_create(&d, &f)) {
         assert_null(f);
@@ -2163,7 +2155,7 @@ static void test_lost_samples_are_counted(void **state)
     gsd_stream *stream;
     static gsd_training_sample s[1000];
     gsd_stats stats;
-    use_counter(&d, &c);
+    count_with(&d, &c);
     OK(gsd_create(&d, &f));
     OK(gsd_stream_create(f, &stream));
     gsd_view v = gsd_get_view(f);
@@ -2187,7 +2179,7 @@ static void test_queries_do_not_allocate(void **state)
     (void)state;
     counter c = {0};
     gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
-    use_counter(&d, &c);
+    count_with(&d, &c);
     gsd_field *f = train(&d, 2, 2000);
     long before = c.requests;
     gsd_view v = gsd_get_view(f);
@@ -2215,7 +2207,7 @@ static void test_memory_cap_holds_and_the_field_still_learns(void **state)
         d.rho = 0.0005f;
         d.min_samples = 1;
         d.alias = alias;
-        use_counter(&d, &c);
+        count_with(&d, &c);
         gsd_field *f;
         OK(gsd_create(&d, &f));
         size_t peak = 0;
