@@ -13,9 +13,10 @@
 #   make format      clang-format in place  make lint        only check
 #
 #   config=release|debug|scalar|sanitize|tsan|coverage    each has its own folder (build/, build-debug/, ...)
-#   CC=clang  V=1  WERROR=1  NO_INSTALL=1  TESTS="sdtree bsdf"  GUIDE_SCENES=folder with downloaded scenes
+#   CC=clang  V=1  WERROR=1  NO_INSTALL=1  TESTS="sdtree bsdf"  TEST_FILTER="*threads*"  TEST_JOBS=1
+#   GUIDE_SCENES=folder with downloaded scenes   DEMO_SECONDS=40  DEMO_SIZE=320x180
 #   OPENPGL_DIR=installation of Intel Open PGL: builds the renderer's method openpgl
-#   DNNL_DIR=installation of oneDNN 2 (else the system's, if any): bench_nn compares with it   DEMO_SECONDS=40  DEMO_SIZE=320x180
+#   DNNL_DIR=installation of oneDNN 2 (else the system's, if any): bench_nn compares with it
 
 config ?= release
 DEMO_SECONDS ?= 40
@@ -96,6 +97,8 @@ TRACER_OBJ := $(TRACER_SRC:examples/tracer/%.c=$(B)/obj/tracer/%.o) $(if $(OPENP
 PROGRAMS := $(patsubst examples/tracer/%.c,$(B)/%,$(wildcard $(TRACER_MAINS:%=examples/tracer/%.c)))
 EXAMPLES := $(patsubst examples/%.c,$(B)/examples/%,$(wildcard examples/*.c))
 TESTS_ALL := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/test_*.c))
+# The other tests are of the headers alone.
+TRACER_TESTS := bsdf image light photon_pass render scene
 MICRO := $(B)/bench_sdtree $(B)/bench_kd $(B)/bench_photon $(B)/bench_field $(B)/bench_denoise $(B)/bench_nn
 BENCHES := $(patsubst bench/%.c,$(B)/%,$(wildcard bench/bench_*.c))
 STRESSES := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/stress_*.c))
@@ -172,9 +175,11 @@ $(EXAMPLES): $(B)/examples/%: $(B)/obj/examples/%.o
 	$(SAY) LD $@
 	$(LINK) $(LIBS) -o $@
 
-$(TESTS_ALL): $(B)/tests/%: $(B)/obj/tests/%.o $(B)/libtracer.a
+$(TESTS_ALL): $(B)/tests/%: $(B)/obj/tests/%.o
 	$(SAY) LD $@
-	$(LINK) -lcmocka $(LIBS) -o $@
+	$(LINK) -lcmocka $(if $(filter %.a,$^),$(LIBS),-lm -lpthread) -o $@
+
+$(TRACER_TESTS:%=$(B)/tests/test_%): $(B)/libtracer.a
 
 $(STRESSES): $(B)/tests/%: $(B)/obj/tests/%.o
 	$(SAY) LD $@
@@ -255,7 +260,12 @@ check-deps:
 test: deps
 	$(SUB) run-test
 
-run-test: $(TEST_PROGRAMS) $(PROGRAMS) $(EXAMPLES) $(BENCH_TOOLS) $(B)/bench_field $(if $(filter release,$(config)),$(B)/bench_error)
+# What the tests of the command line and of the rig run; the fast build has the examples too, for the optimiser's warnings.
+CLI_PROGRAMS := $(if $(if $(TESTS),$(filter cli,$(TESTS)),all),$(PROGRAMS) $(B)/make_reference $(B)/bench_field)
+RIG_PROGRAMS := $(if $(filter release,$(config)),$(if $(if $(TESTS),$(filter rig,$(TESTS)),all),$(PROGRAMS) $(B)/bench_error $(B)/study_kd))
+OPTIMISED := $(if $(filter release,$(config)),$(if $(TESTS),,$(EXAMPLES)))
+
+run-test: $(TEST_PROGRAMS) $(CLI_PROGRAMS) $(RIG_PROGRAMS) $(OPTIMISED)
 	@BUILD=$(B) CONFIG=$(config) CC='$(CC)' TESTS='$(TESTS)' bash tests/run.sh $(TEST_PROGRAMS)
 	$(if $(filter coverage,$(config)),@$(MAKE) --no-print-directory coverage-report)
 

@@ -177,6 +177,21 @@ __attribute__((target("avx2,fma"))) static inline float bench_fma_chains(size_t 
     _mm256_storeu_ps(out, a[0]);
     return out[0];
 }
+
+__attribute__((target("avx512f"))) static inline float bench_fma_chains_512(size_t steps)
+{
+    __m512 a[12], x = _mm512_set1_ps(0.999f), y = _mm512_set1_ps(0.001f);
+    float out[16];
+    for (int k = 0; k < 12; ++k)
+        a[k] = _mm512_set1_ps((float)k);
+    for (size_t i = 0; i < steps; ++i)
+        for (int k = 0; k < 12; ++k)
+            a[k] = _mm512_fmadd_ps(a[k], x, y);
+    for (int k = 1; k < 12; ++k)
+        a[0] = _mm512_add_ps(a[0], a[k]);
+    _mm512_storeu_ps(out, a[0]);
+    return out[0];
+}
 #endif
 
 /* Fused multiply-adds in single precision on one core, GFLOP/s (two operations each); 0 = not measured here. */
@@ -189,6 +204,24 @@ static inline double bench_fma_peak(void)
         return 0;
     BENCH_MIN_NS(ns, 6, steps * 12 * 8 * 2, {
         float sum = bench_fma_chains(steps);
+        bench_use(&sum);
+    });
+    return 1 / ns;
+#else
+    return 0;
+#endif
+}
+
+/* The same by vectors of 16 floats; 0 = the machine has none. */
+static inline double bench_fma_peak_512(void)
+{
+#ifdef BENCH_X86
+    size_t steps = 1 << 20;
+    double ns;
+    if (!__builtin_cpu_supports("avx512f"))
+        return 0;
+    BENCH_MIN_NS(ns, 6, steps * 12 * 16 * 2, {
+        float sum = bench_fma_chains_512(steps);
         bench_use(&sum);
     });
     return 1 / ns;
@@ -250,27 +283,33 @@ static inline const char *bench_compiler(void)
 #endif
 }
 
+typedef struct bench_limits {
+    double fma, fma_512; /* GFLOP/s of one core, by vectors of 8 and of 16 floats; 0 = not measured here */
+} bench_limits;
+
 /* What was measured, on what: the first lines of every benchmark. The Makefile tells flags and commit. */
-static inline void bench_print_machine(FILE *json)
+static inline bench_limits bench_print_machine(FILE *json)
 {
     char cpu[200];
     const char *flags = getenv("BENCH_FLAGS"), *commit = getenv("BENCH_COMMIT"), *compiler = bench_compiler();
     bench_cpu(cpu, sizeof cpu);
     double small = bench_load_latency((size_t)1 << 18), middle = bench_load_latency((size_t)1 << 22);
-    double large = bench_load_latency((size_t)1 << 26), read = bench_read_bandwidth();
-    double fma = bench_fma_peak(), copy = bench_copy_ms();
+    double large = bench_load_latency((size_t)1 << 26), read = bench_read_bandwidth(), copy = bench_copy_ms();
+    bench_limits limits = {bench_fma_peak(), bench_fma_peak_512()};
     printf("machine: %s; %s; flags: %s; commit: %s\n", cpu, compiler, flags ? flags : "not told",
            commit ? commit : "not told");
     printf(
-        "limits:  FMA %.0f GFLOP/s; copy of 2048^2 floats %.2f ms; memory read %.1f GB/s; random load 256 KB %.1f ns, "
-        "4 MB %.1f ns, 64 MB %.1f ns\n",
-        fma, copy, read, small, middle, large);
+        "limits:  FMA %.0f GFLOP/s, %.0f by AVX-512; copy of 2048^2 floats %.2f ms; memory read %.1f GB/s; random load "
+        "256 KB %.1f ns, 4 MB %.1f ns, 64 MB %.1f ns\n",
+        limits.fma, limits.fma_512, copy, read, small, middle, large);
     if (json)
         fprintf(json,
                 "{\"machine\": {\"cpu\": \"%s\", \"compiler\": \"%s\", \"flags\": \"%s\", \"commit\": \"%s\", "
-                "\"fma_gflops\": %.1f, \"copy_ms\": %.3f, \"read_gb_s\": %.1f, \"load_ns\": [%.1f, %.1f, %.1f]},\n"
-                "\"rows\": [",
-                cpu, compiler, flags ? flags : "", commit ? commit : "", fma, copy, read, small, middle, large);
+                "\"fma_gflops\": %.1f, \"fma_512_gflops\": %.1f, \"copy_ms\": %.3f, \"read_gb_s\": %.1f, "
+                "\"load_ns\": [%.1f, %.1f, %.1f]},\n\"rows\": [",
+                cpu, compiler, flags ? flags : "", commit ? commit : "", limits.fma, limits.fma_512, copy, read, small,
+                middle, large);
+    return limits;
 }
 
 /* ---- rows of a table, on screen and as JSON */

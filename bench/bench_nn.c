@@ -56,40 +56,6 @@ static float *random_floats(size_t count, uint64_t seed)
     return p;
 }
 
-#ifdef BENCH_X86
-__attribute__((target("avx512f"))) static float wide_chains(size_t steps)
-{
-    __m512 a[12], x = _mm512_set1_ps(0.999f), y = _mm512_set1_ps(0.001f);
-    float out[16];
-    for (int k = 0; k < 12; ++k)
-        a[k] = _mm512_set1_ps((float)k);
-    for (size_t i = 0; i < steps; ++i)
-        for (int k = 0; k < 12; ++k)
-            a[k] = _mm512_fmadd_ps(a[k], x, y);
-    for (int k = 1; k < 12; ++k)
-        a[0] = _mm512_add_ps(a[0], a[k]);
-    _mm512_storeu_ps(out, a[0]);
-    return out[0];
-}
-#endif
-
-/* GFLOP/s of the level's vectors; 0 = not measured here. */
-static double level_peak(void)
-{
-#ifdef BENCH_X86
-    if (level == GNN_SIMD_AVX512) {
-        size_t steps = 1 << 20;
-        double ns;
-        BENCH_MIN_NS(ns, 6, steps * 12 * 16 * 2, {
-            float sum = wide_chains(steps);
-            bench_use(&sum);
-        });
-        return 1 / ns;
-    }
-#endif
-    return bench_fma_peak();
-}
-
 /* time in ns for `operations`; naive in ns, 0 = none; target in ms, 0 = none. */
 static void row(const char *name, bench_time t, double operations, double naive, double target)
 {
@@ -345,14 +311,14 @@ int main(int argc, char **argv)
                 fail("cannot write the JSON file");
         } else
             fail("unknown option, or its value is missing; the first lines of bench_nn.c list them");
-    bench_print_machine(json_file);
+    bench_limits limits = bench_print_machine(json_file);
     for (int i = 0; i < 4; ++i) {
         if (gnn_resolve_simd(all[i]) != all[i])
             continue;
         char what[80];
         level = all[i];
         level_name = names[i];
-        peak = level_peak();
+        peak = level == GNN_SIMD_AVX512 ? limits.fma_512 : limits.fma;
         snprintf(what, sizeof what, "%s, FMA peak %.0f GFLOP/s", level_name, peak);
         row_titles(what);
         bool best = level == gnn_resolve_simd(GNN_SIMD_AUTO);

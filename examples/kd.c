@@ -1,6 +1,6 @@
 /* A complete path tracer with and without guiding: a room that gets its light through a door that is ajar.
    cc -O2 -I. examples/kd.c -lembree3 -lm -o kd && ./kd      (or -lembree4)
-   Writes kd.pgm (left without, right with guiding, equal samples) and prints the errors against a longer render. */
+   Writes kd.pgm (left without, right with guiding, equal samples), prints the errors; ./kd 5 makes 5 passes, not 7. */
 #define GKD_IMPLEMENTATION
 #include "guide_kd.h"
 #include <stdio.h>
@@ -27,8 +27,8 @@ static float rnd(void) // in [0, 1)
 }
 static float dot(const float *a, const float *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
-// The box that the ray hits; moves p there; n is the normal on the ray's side.
-static const struct box *trace(float *p, const float *d, float *n)
+// The box that the ray hits; moves p there; n is the normal on the ray's side, nearness 1 / distance.
+static const struct box *trace(float *p, const float *d, float *n, float *nearness)
 {
     struct RTCRayHit r = {.ray = {p[0], p[1], p[2], 1e-4f, d[0], d[1], d[2], 0, 1e9f, ~0u, 0, 0}};
     r.hit.geomID = RTC_INVALID_GEOMETRY_ID;
@@ -44,6 +44,7 @@ static const struct box *trace(float *p, const float *d, float *n)
         n[k] = ng[k] * scale;
         p[k] += r.ray.tfar * d[k];
     }
+    *nearness = 1 / r.ray.tfar;
     return r.hit.geomID == RTC_INVALID_GEOMETRY_ID ? NULL : &boxes[r.hit.primID / 6];
 }
 
@@ -59,10 +60,10 @@ static void sample_cosine(const float *n, float *d) // a point on the unit spher
 static float radiance(float *p, float *d, const gkd_view *field, gkd_stream *stream)
 {
     gkd_training_sample vertex[MAX_DEPTH]; // what to learn: filled in on the way, completed on the way back
-    float n[3], f_cos[MAX_DEPTH];
+    float n[3], f_cos[MAX_DEPTH], unused;
     int count = 0;
-    const struct box *hit = trace(p, d, n);
-    while (hit && !(hit->light > 0) && count < MAX_DEPTH) { // lamps do not reflect
+    const struct box *hit = trace(p, d, n, &unused);
+    for (; hit && !(hit->light > 0) && count < MAX_DEPTH; ++count) { // lamps do not reflect
         float u[2] = {rnd(), rnd()};
         gkd_handle handle;
         gkd_find(field, p, n, NULL, &handle);    // 1. Find the cell, and its lobes as seen from here.
@@ -75,11 +76,9 @@ static float radiance(float *p, float *d, const gkd_view *field, gkd_stream *str
         float pdf_guide = alpha < 1 ? gkd_pdf(&handle, d) : 0;
         float pdf = alpha * pdf_bsdf + (1 - alpha) * pdf_guide; // ... and divide by the density of both.
         f_cos[count] = hit->grey / 3.14159265f * cosine;
-        float at[3] = {p[0], p[1], p[2]}, normal[3] = {n[0], n[1], n[2]};
-        hit = cosine > 0 ? trace(p, d, n) : NULL; // 3. How far away is what the lobe shows?
-        float gone[3] = {p[0] - at[0], p[1] - at[1], p[2] - at[2]}, distance = cosine > 0 ? sqrtf(dot(gone, gone)) : 1;
-        vertex[count++] = gkd_make_scalar_sample(at, d, normal, distance + 1e-6f, cosine > 0 ? 0 : GKD_REJECTED, 0, 0,
-                                                 pdf, pdf_bsdf, pdf_guide);
+        vertex[count] =
+            gkd_make_scalar_sample(p, d, n, INFINITY, cosine > 0 ? 0 : GKD_REJECTED, 0, 0, pdf, pdf_bsdf, pdf_guide);
+        hit = cosine > 0 ? trace(p, d, n, &vertex[count].nearness) : NULL; // 3. How far away is what the lobe shows?
     }
     float L = hit ? hit->light : 0;
     for (int i = count - 1; i >= 0 && L > 0; --i) { // 4. Back along the path: L comes from vertex[i].direction.
@@ -99,9 +98,7 @@ static void render(float *image, int passes, gkd_field *field, gkd_stream *strea
         gkd_view view = gkd_get_view(field);
         for (int i = 0; i < PIXELS << pass; ++i) {
             float x = ((float)(i % W) + rnd()) / W - 0.5f, y = ((float)(i / W % H) + rnd()) / H - 0.5f;
-            float p[3] = {1, 0.05f, 0.75f}, d[3] = {1.2f * x, 1, -0.9f * y}, length = sqrtf(dot(d, d));
-            for (int k = 0; k < 3; ++k)
-                d[k] /= length;
+            float p[3] = {1, 0.05f, 0.75f}, d[3] = {1.2f * x, 1, -0.9f * y};
             image[i % PIXELS] += radiance(p, d, &view, stream) / (float)((1 << passes) - 1);
         }
         if (stream) { // 5. Learn from the pass.
@@ -112,11 +109,12 @@ static void render(float *image, int passes, gkd_field *field, gkd_stream *strea
     }
 }
 
-int main(void)
+int main(int argc, char **argv)
 {
     static const unsigned char quad[24] = {0, 2, 6, 4, 1, 5, 7, 3, 0, 4, 5, 1, 2, 3, 7, 6, 0, 1, 3, 2, 4, 6, 7, 5};
     static float image[3][PIXELS]; // unguided, guided, reference
     double error[2] = {0, 0};
+    int passes = argc > 1 ? atoi(argv[1]) : 7;
     gkd_desc desc = {.bounds_max = {3, 2, 1.5f}}; // the rest: defaults
     gkd_field *field;
     gkd_stream *stream;
@@ -136,17 +134,15 @@ int main(void)
     rtcAttachGeometry(scene, g);
     rtcReleaseGeometry(g);
     rtcCommitScene(scene);
-    render(image[0], 7, field, NULL);
-    render(image[1], 7, field, stream);
-    render(image[2], 8, field, stream); // goes on learning
+    for (int i = 0; i < 3; ++i) // the reference goes on learning
+        render(image[i], i < 2 ? passes : passes + 1, field, i ? stream : NULL);
     fprintf(file, "P5 %d %d 255\n", 2 * W, H);
     for (int i = 0; i < 2 * PIXELS; ++i) {
         int side = i / W % 2, pixel = i / (2 * W) * W + i % W;
-        double grey = 255 * sqrt(9 * image[side][pixel]);
         error[side] += pow(image[side][pixel] - image[2][pixel], 2) / PIXELS;
-        fputc(grey < 255 ? (int)grey : 255, file);
+        fputc((int)fmin(255, 255 * sqrt(9 * image[side][pixel])), file);
     }
-    printf("squared error at 127 samples per pixel: %.2e without, %.2e with guiding\n", error[0], error[1]);
+    printf("squared error, %d samples a pixel: %.2e unguided, %.2e guided\n", (1 << passes) - 1, error[0], error[1]);
     fclose(file);
     gkd_stream_destroy(stream);
     gkd_destroy(field);

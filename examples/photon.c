@@ -1,49 +1,46 @@
 /* photon.c: photons guide camera paths, with nothing but guide_photon.h and the C library.
-
    cc -O2 -I. examples/photon.c -o photon -lm && ./photon
-
    A room of 2 x 1 x 1 m whose lamp, a hand wide, is behind a wall with a door ajar. The floor of the dark half is
    rendered twice with the same number of camera paths, by path tracing alone and guided by as many photons; the
-   variance of both is printed. */
+   variance of both is printed. There are 6 passes of 2, 4, 8 ... paths per pixel; ./photon 4 makes 4. */
 #define GPH_IMPLEMENTATION
 #include "guide_photon.h"
-
 #include <stdio.h>
 
-enum { SIZE = 64, PASSES = 6, DEPTH = 12 }; /* pixels across, passes of 2, 4, 8 ... paths per pixel, path length */
+enum { SIZE = 64, DEPTH = 12 }; /* pixels across, path length */
 #define ALBEDO 0.7f
 #define PI 3.14159265f
 
 static const float room[3] = {2, 1, 1};                  /* corner opposite to the origin */
 static const float lamp[2] = {1.6f, 0.3f}, half = 0.05f; /* on the ceiling */
-static uint64_t rng = 1;
 
 static float random_float(void)
 {
+    static uint64_t rng = 1;
     rng = rng * 6364136223846793005ull + 1442695040888963407ull;
     return (float)(rng >> 40) / 16777216.0f;
 }
 
-/* Move p along d to the next surface; returns the axis of its normal, and the light it emits. */
-static int trace(float p[3], const float d[3], float *emitted)
+/* Move p along d to the next surface; returns the distance, the axis of the normal and its side, and the light. */
+static float trace(float p[3], const float d[3], int *axis, float *side, float *emitted)
 {
     float t = 1e30f, wall = (1 - p[0]) / d[0], y = p[1] + wall * d[1];
-    int axis = 0;
     for (int k = 0; k < 3; ++k) {
         float s = ((d[k] > 0 ? room[k] : 0) - p[k]) / d[k];
         if (d[k] != 0 && s < t) {
             t = s;
-            axis = k;
+            *axis = k;
         }
     }
     if (d[0] != 0 && wall > 1e-5f && wall < t && y < 0.9f) { /* the door leaves 10 cm open at y = 1 */
         t = wall;
-        axis = 0;
+        *axis = 0;
     }
     for (int k = 0; k < 3; ++k)
         p[k] += t * d[k];
-    *emitted = axis == 2 && d[2] > 0 && fabsf(p[0] - lamp[0]) < half && fabsf(p[1] - lamp[1]) < half ? 320.0f : 0;
-    return axis;
+    *side = d[*axis] > 0 ? -1.0f : 1.0f;
+    *emitted = *axis == 2 && d[2] > 0 && fabsf(p[0] - lamp[0]) < half && fabsf(p[1] - lamp[1]) < half ? 320.0f : 0;
+    return t;
 }
 
 /* Cosine-distributed direction around the axis. */
@@ -62,15 +59,10 @@ static void trace_photon(gph_stream *stream)
     int axis = 2;
     float side = -1;
     do {
-        float from[3] = {p[0], p[1], p[2]}, unused, back[3], l = 0;
+        float unused;
         scatter(axis, side, d);
-        axis = trace(p, d, &unused);
-        side = d[axis] > 0 ? -1.0f : 1.0f;
-        for (int k = 0; k < 3; ++k) {
-            back[k] = from[k] - p[k];
-            l += back[k] * back[k];
-        }
-        gph_photon photon = gph_make_photon(p, back, sqrtf(l), 1); /* every path has the same power */
+        float distance = trace(p, d, &axis, &side, &unused), back[3] = {-d[0], -d[1], -d[2]};
+        gph_photon photon = gph_make_photon(p, back, distance, 1); /* every path has the same power */
         gph_record_photons(stream, &photon, 1);
     } while (random_float() < ALBEDO);
 }
@@ -79,9 +71,9 @@ static void trace_photon(gph_stream *stream)
 static float radiance(float p[3], int axis, float side, const gph_view *field, gph_stream *stream)
 {
     gph_vertex vertex[DEPTH];
-    float emitted[DEPTH], fcos[DEPTH], light = 0;
+    float emitted[DEPTH] = {0}, fcos[DEPTH], cosine = 1, light = 0;
     int n = 0;
-    while (n < DEPTH) {
+    for (; n < DEPTH && cosine > 0; ++n) { /* until it goes into the wall */
         float normal[3] = {0, 0, 0}, u[2] = {random_float(), random_float()}, d[3];
         gph_handle handle;
         normal[axis] = side;
@@ -92,15 +84,13 @@ static float radiance(float p[3], int axis, float side, const gph_view *field, g
             gph_sample(&handle, u, d);
         else
             scatter(axis, side, d);
-        float pdf_guide = stream ? gph_pdf(&handle, d) : 0, cosine = fmaxf(d[axis] * side, 0), pdf_bsdf = cosine / PI;
+        cosine = fmaxf(d[axis] * side, 0);
+        float pdf_guide = stream ? gph_pdf(&handle, d) : 0, pdf_bsdf = cosine / PI;
         fcos[n] = ALBEDO / PI * cosine;
         vertex[n] = gph_make_vertex(p, 0, alpha * pdf_bsdf + (1 - alpha) * pdf_guide, pdf_bsdf, pdf_guide,
                                     guided ? GPH_FROM_GUIDE : GPH_FROM_BSDF);
-        emitted[n++] = 0;
-        if (!(cosine > 0))
-            break;
-        axis = trace(p, d, &emitted[n - 1]);
-        side = d[axis] > 0 ? -1.0f : 1.0f;
+        if (cosine > 0)
+            trace(p, d, &axis, &side, &emitted[n]);
     }
     for (int i = n - 1; i >= 0; --i) { /* back along the path */
         vertex[i].contribution = (emitted[i] + light) * fcos[i];
@@ -112,10 +102,10 @@ static float radiance(float p[3], int axis, float side, const gph_view *field, g
 }
 
 /* Render all passes; returns the variance of the mean pixel at the end, and what the floor looks like on average. */
-static double render(gph_field *field, gph_stream *stream, double *mean)
+static double render(int passes, gph_field *field, gph_stream *stream, double *mean)
 {
     double weights = 0;
-    for (int pass = 0; pass < PASSES; ++pass) {
+    for (int pass = 0; pass < passes; ++pass) {
         gph_view view = gph_get_view(field);
         double variance = 0, all = 0, paths = 2 << pass;
         for (int i = 0; i < SIZE * SIZE; ++i) {
@@ -143,16 +133,16 @@ static double render(gph_field *field, gph_stream *stream, double *mean)
     return 1 / weights;
 }
 
-int main(void)
+int main(int argc, char **argv)
 {
-    static gph_desc desc; // zero: all defaults but the grid's
+    int passes = argc > 1 ? atoi(argv[1]) : 6;
+    gph_desc desc = {.grid_cells = 16}; /* few photons: large voxels at first; the rest: defaults */
     gph_field *field;
     gph_stream *stream;
     double mean[2] = {0, 0};
-    desc.grid_cells = 16; /* few photons: large voxels at first */
     if (gph_create(&desc, &field) || gph_stream_create(field, &stream))
         return 1;
-    double unguided = render(field, NULL, &mean[0]), guided = render(field, stream, &mean[1]);
+    double unguided = render(passes, field, NULL, &mean[0]), guided = render(passes, field, stream, &mean[1]);
     printf("means %.4g and %.4g; guided / unguided variance: %.3g\n", mean[0], mean[1], guided / unguided);
     gph_stream_destroy(stream);
     gph_destroy(field);

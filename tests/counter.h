@@ -1,4 +1,4 @@
-/* counter.h: an allocator that counts and fails, for the tests. After guide_sdtree.h. */
+/* counter.h: an allocator that counts and fails, for the tests of any header. */
 #ifndef TEST_COUNTER_H
 #define TEST_COUNTER_H
 
@@ -39,11 +39,7 @@ static inline void count_release(void *user, void *pointer)
     free(p);
 }
 
-static inline void use_counter(gsd_desc *d, counter *c)
-{
-    d->allocate = count_allocate;
-    d->release = count_release;
-    d->user = c;
-}
+/* Let a descriptor of any header allocate by c. */
+#define count_with(desc, c) ((desc)->allocate = count_allocate, (desc)->release = count_release, (desc)->user = (c))
 
 #endif

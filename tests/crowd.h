@@ -1,4 +1,4 @@
-/* crowd.h: a gsd_parallel_fn for the tests. After cmocka and guide_sdtree.h. */
+/* crowd.h: a parallel_for that any header takes, for the tests. After cmocka. */
 #ifndef TEST_CROWD_H
 #define TEST_CROWD_H
 
@@ -10,8 +10,9 @@ typedef struct crowd {
     int threads;
     uint32_t grains;
 } crowd;
+typedef void (*crowd_fn)(void *context, uint32_t begin, uint32_t end);
 typedef struct crowd_job {
-    gsd_range_fn fn;
+    crowd_fn fn;
     void *context;
     uint32_t count, grain;
     int threads, me;
@@ -30,7 +31,7 @@ static inline void *crowd_main(void *p)
     return NULL;
 }
 
-static inline void crowd_for(void *user, uint32_t count, uint32_t grain, gsd_range_fn fn, void *context)
+static inline void crowd_for(void *user, uint32_t count, uint32_t grain, crowd_fn fn, void *context)
 {
     crowd *c = user;
     pthread_t threads[8];

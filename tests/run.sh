@@ -1,13 +1,14 @@
 #!/usr/bin/env bash
-# Run test programs (cmocka, TAP), the compile matrix and the command-line tests; say how long each test took; end with
+# Run test programs (cmocka, TAP), the compile matrix and the command-line tests, several at a time; say how long each
+# test took and how many CPU seconds each program; end with the slowest tests and
 #   N passed, N failed
 # Exit status 1 where a test failed, a program crashed, or fewer tests ran than tests/expected-count says.
 # Environment: BUILD folder, CONFIG, CC, TESTS = names to run (empty = all; "matrix", "uninitialised", "rig" and "cli"
-# are names too),
-# RECORD=1 rewrites tests/expected-count.
+# are names too), TEST_FILTER = pattern of the names of cmocka's tests, TEST_JOBS = programs at a time (the processors;
+# the rig times programs and is always alone), RECORD=1 rewrites tests/expected-count.
 export LC_ALL=C
 cd "$(dirname "$0")/.." || exit 1
-: "${BUILD:=build}" "${CONFIG:=release}" "${CC:=cc}"
+: "${BUILD:=build}" "${CONFIG:=release}" "${CC:=cc}" "${TEST_JOBS:=$(nproc 2>/dev/null || echo 2)}"
 export BUILD CONFIG CC
 export CMOCKA_MESSAGE_OUTPUT=TAP
 export ASAN_OPTIONS="detect_leaks=1:allocator_may_return_null=1:${ASAN_OPTIONS-}"
@@ -20,22 +21,27 @@ if [ "$CONFIG" = tsan ] && [ -z "${UNRANDOMISED-}" ] && setarch -R true 2>/dev/n
     UNRANDOMISED=1 exec setarch -R bash "$PWD/tests/run.sh" "$@"
 fi
 
-passed=0 failed=0 skipped=0 recorded=
-failures=
+tmp=$(mktemp -d) || exit 1
+trap 'rm -rf "$tmp"' EXIT
 microseconds() { # bash 5 has a fine clock; others count in seconds
     local t=${EPOCHREALTIME:-$(date +%s).000000}
     echo "${t/./}"
 }
+# complain TEXT: a failure of the program that runs now.
+complain() { printf '  %s: %s\n' "$name" "$1" >>"$tmp/$name.failures"; }
 
-# run NAME COMMAND...: stream its TAP, time each test by when its line arrives.
+# run NAME COMMAND...: stream its TAP, time each test by when its line arrives. $tmp/NAME.* get the counts, the failures,
+# the plan and the times.
 run() {
-    local name=$1 line last now p=0 f=0 s=0 status start plan=-1 text
+    local name=$1 line last now p=0 f=0 s=0 status start plan=-1 text want cpu=0
     shift
+    : >"$tmp/$name.failures"
     printf '%s\n' "== $name"
     start=$(microseconds) last=$start
     while IFS= read -r line; do
         case $line in
         "exit status "*) status=${line#exit status } ;;
+        "cpu seconds "*) cpu=${line#cpu seconds } ;;
         1..[0-9]*)
             [ "$plan" -lt 0 ] && plan=0
             plan=$((plan + ${line#1..}))
@@ -49,45 +55,81 @@ run() {
             case $line in
             *"# SKIP"*) s=$((s + 1)) ; text="skip  ${text#\# SKIP }" ;;
             "ok "*) p=$((p + 1)) ; text="ok    $text" ;;
-            *) f=$((f + 1)) ; text="FAIL  $text" ; failures="$failures  $name: ${text#FAIL  }"$'\n' ;;
+            *) f=$((f + 1)) ; text="FAIL  $text" ; complain "${text#FAIL  }" ;;
             esac
             printf '%8d ms  %s\n' $(((now - last) / 1000)) "$text"
+            printf '%8d ms  %s: %s\n' $(((now - last) / 1000)) "$name" "${text#ok    }" >>"$tmp/$name.times"
             last=$now
             ;;
         "") ;;
         *) printf '             %s\n' "$line" ;;
         esac
-    done < <("$@" 2>&1; printf "\nexit status %d\n" $?)
+    done < <(
+        "$@" 2>&1
+        printf '\nexit status %d\n' $?
+        times >"$tmp/$name.cpu"
+        awk -F '[ms ]+' 'NR == 2 { printf "cpu seconds %.1f\n", 60 * ($1 + $3) + $2 + $4 }' "$tmp/$name.cpu"
+    )
     now=$(microseconds)
     # A program that stops early, or fails without a failed test (a sanitizer's report at exit), is a failure.
     if [ "${status:-1}" -ne 0 ] && [ "$f" -eq 0 ]; then
-        f=1 failures="$failures  $name: exit status ${status:-unknown}"$'\n'
+        f=1
+        complain "exit status ${status:-unknown}"
         echo "       FAIL  exit status ${status:-unknown}"
     elif [ "$plan" -ge 0 ] && [ $((p + f + s)) -lt "$plan" ]; then
-        f=$((f + 1)) failures="$failures  $name: stopped after $((p + f + s - 1)) of $plan tests"$'\n'
+        f=$((f + 1))
+        complain "stopped after $((p + f + s - 1)) of $plan tests"
         echo "       FAIL  stopped early"
     fi
-    local want
-    want=$(sed -n "s/^$name //p" tests/expected-count 2>/dev/null)
+    want=1
+    [ -n "${TEST_FILTER-}" ] || want=$(sed -n "s/^$name //p" tests/expected-count 2>/dev/null)
     if [ -z "${RECORD-}" ] && [ $((p + f + s)) -lt "${want:-1}" ]; then
-        f=$((f + 1)) failures="$failures  $name: only $((p + s)) tests ran, ${want:-1} expected"$'\n'
+        f=$((f + 1))
+        complain "only $((p + s)) tests ran, ${want:-1} expected"
         echo "       FAIL  only $((p + s)) tests ran, ${want:-1} expected"
     fi
     [ "$plan" -ge 0 ] || plan=$((p + f + s))
-    recorded="$recorded$name $plan"$'\n'
-    printf '   %d passed, %d failed, %d skipped in %d.%02d s\n' $p $f $s \
-        $(((now - start) / 1000000)) $(((now - start) / 10000 % 100))
-    passed=$((passed + p)) failed=$((failed + f)) skipped=$((skipped + s))
+    printf '   %d passed, %d failed, %d skipped in %d.%02d s, %s CPU seconds\n' $p $f $s \
+        $(((now - start) / 1000000)) $(((now - start) / 10000 % 100)) "$cpu"
+    echo "$p $f $s $plan $cpu" >"$tmp/$name.counts"
 }
 
 wanted() { [ -z "${TESTS-}" ] || case " $TESTS " in *" $1 "*) true ;; *) false ;; esac; }
 
-for program in "$@"; do run "$(basename "$program")" "$program"; done
-# The matrix compiles the headers by itself: once is enough, not once per configuration.
-if [ "$CONFIG" = release ] && wanted matrix; then run matrix bash tests/compile-matrix.sh; fi
-if [ "$CONFIG" = release ] && wanted uninitialised; then run uninitialised bash tests/uninitialised.sh; fi
-if [ "$CONFIG" = release ] && wanted rig; then run rig bash tests/rig.sh; fi # times: only the fast build's say anything
-if [ -x "$BUILD/render" ] && wanted cli; then run cli bash tests/run-cli.sh; fi
+# What runs, longest first. The matrix compiles the headers by itself: once is enough, not once per configuration.
+names=() commands=()
+plan() { names+=("$1") commands+=("$2"); }
+if [ "$CONFIG" = release ] && wanted matrix; then plan matrix 'bash tests/compile-matrix.sh'; fi
+if [ -x "$BUILD/render" ] && wanted cli; then plan cli 'bash tests/run-cli.sh'; fi
+for program in "$@"; do plan "$(basename "$program")" "$program"; done
+if [ "$CONFIG" = release ] && wanted uninitialised; then plan uninitialised 'bash tests/uninitialised.sh'; fi
+
+# worker: run what no other worker has taken; where there are others, say all of a program at once.
+worker() {
+    local i
+    for i in "${!names[@]}"; do
+        mkdir "$tmp/$i" 2>/dev/null || continue
+        if [ "$TEST_JOBS" -eq 1 ] || [ ${#names[@]} -eq 1 ]; then
+            run "${names[i]}" ${commands[i]}
+        else
+            run "${names[i]}" ${commands[i]} >"$tmp/${names[i]}.log"
+            until mkdir "$tmp/saying" 2>/dev/null; do sleep 0.05; done
+            cat "$tmp/${names[i]}.log"
+            rmdir "$tmp/saying"
+        fi
+    done
+}
+for ((job = 0; job < TEST_JOBS; ++job)); do worker & done
+wait
+# Times: only the fast build's say anything, and only alone.
+if [ "$CONFIG" = release ] && wanted rig; then plan rig '' && run rig bash tests/rig.sh; fi
+
+passed=0 failed=0 skipped=0 recorded=
+for name in "${names[@]}"; do
+    read -r p f s planned cpu <"$tmp/$name.counts" || { complain 'did not end' && p=0 f=1 s=0 planned=0; }
+    recorded="$recorded$name $planned"$'\n'
+    passed=$((passed + p)) failed=$((failed + f)) skipped=$((skipped + s))
+done
 
 if [ -n "${RECORD-}" ]; then
     {
@@ -100,14 +142,19 @@ elif [ -z "${TESTS-}" ] && [ -e tests/expected-count ]; then
         case $name in '#' | '') continue ;; esac
         case $name in matrix | rig | uninitialised) [ "$CONFIG" != release ] && continue ;; esac
         case $'\n'"$recorded" in *$'\n'"$name "*) ;; *)
-            failed=$((failed + 1)) failures="$failures  $name: did not run ($count tests expected)"$'\n' ;;
+            failed=$((failed + 1))
+            complain "did not run ($count tests expected)" ;;
         esac
     done <tests/expected-count
 fi
 if [ $((passed + failed)) -eq 0 ]; then
-    failed=1 failures="$failures  no test ran"$'\n'
+    failed=1 name=tests
+    complain 'none ran'
 fi
-[ -n "$failures" ] && printf '\nfailed:\n%s' "$failures"
+printf '\nslowest:\n'
+cat "$tmp"/*.times 2>/dev/null | sort -rn | head -n 8
+cat "$tmp"/*.counts 2>/dev/null | awk '{ sum += $5 } END { printf "%.0f CPU seconds in all\n", sum }'
+if [ "$failed" -gt 0 ]; then printf '\nfailed:\n' && cat "$tmp"/*.failures; fi
 [ "$skipped" -gt 0 ] && printf '\n%d skipped' "$skipped"
 printf '\n%d passed, %d failed\n' "$passed" "$failed"
 [ "$failed" -eq 0 ]

@@ -9,7 +9,6 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <unistd.h>
 
 #define GKD_IMPLEMENTATION
 #include "guide_kd.h"
@@ -23,21 +22,6 @@
 #include "rng.h"
 
 /* ---- helpers */
-
-static void random_direction(float d[3])
-{
-    double z = 2 * rnd() - 1, phi = 2 * PI * rnd(), r = sqrt(1 - z * z);
-    d[0] = (float)(r * cos(phi));
-    d[1] = (float)(r * sin(phi));
-    d[2] = (float)z;
-}
-
-static void count_with(gkd_desc *d, counter *c)
-{
-    d->allocate = count_allocate;
-    d->release = count_release;
-    d->user = c;
-}
 
 /* The levels that this machine has, from the plainest up. */
 static uint32_t levels_here(gkd_simd out[5])
@@ -235,39 +219,6 @@ static void test_documented_defaults_are_the_defaults(void **state)
     assert_int_equal(d.alpha_mode, GKD_ALPHA_GRID);
     assert_int_not_equal(d.simd, GKD_SIMD_AUTO);
     assert_true(d.allocate && d.release);
-}
-
-/* The example in the opening comment compiles as it stands, and runs. */
-static void test_the_example_in_the_comment_compiles(void **state)
-{
-    (void)state;
-    FILE *f = fopen("guide_kd.h", "r");
-    const char *root = f ? "." : "..";
-    char line[512], command[1024], source[80], program[64];
-    int lines = 0;
-    f = f ? f : fopen("../guide_kd.h", "r");
-    assert_non_null(f);
-    snprintf(program, sizeof program, "/tmp/gkd_example_%ld", (long)getpid());
-    snprintf(source, sizeof source, "%s.c", program);
-    FILE *out = fopen(source, "w");
-    assert_non_null(out);
-    while (fgets(line, sizeof line, f)) {
-        if (!lines && strncmp(line, "       #define GKD_IMPLEMENTATION", 33) != 0)
-            continue;
-        if (strncmp(line, "       ", 7) != 0)
-            break;
-        fputs(line + 7, out);
-        lines++;
-    }
-    fclose(f);
-    fclose(out);
-    assert_true(lines >= 15 && lines <= 35);
-    snprintf(command, sizeof command, "%s -std=c99 -Wall -Wextra -Werror -I%s %s -o %s -lm && %s",
-             getenv("CC") ? getenv("CC") : "cc", root, source, program, program);
-    int status = system(command);
-    remove(source);
-    remove(program);
-    assert_int_equal(status, 0);
 }
 
 static void test_bad_descriptors_are_refused_by_name(void **state)
@@ -1701,7 +1652,6 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(test_documented_defaults_are_the_defaults),
-        cmocka_unit_test(test_the_example_in_the_comment_compiles),
         cmocka_unit_test(test_bad_descriptors_are_refused_by_name),
         cmocka_unit_test(test_documented_limits_are_accepted),
         cmocka_unit_test(test_sizes_are_as_documented),

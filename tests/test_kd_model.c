@@ -51,18 +51,10 @@ static void floats(const double in[3], float out[3])
     }
 }
 
-static void any_direction(double d[3])
-{
-    double z = 2 * rnd() - 1, phi = 2 * PI * rnd(), r = sqrt(1 - z * z);
-    d[0] = r * cos(phi);
-    d[1] = r * sin(phi);
-    d[2] = z;
-}
-
 static void any_direction_f(float f[3])
 {
     double d[3];
-    any_direction(d);
+    random_direction_double(d);
     floats(d, f);
 }
 
@@ -148,7 +140,7 @@ static void draw_reference(const reference *r, double out[3])
     double u = rnd();
     uint32_t k = 0;
     if (rnd() < r->uniform) {
-        any_direction(out);
+        random_direction_double(out);
         return;
     }
     while (k + 1 < r->count && u >= r->weight[k])
@@ -272,7 +264,7 @@ static void test_density_of_a_lobe_is_the_formula(void **state)
             BELOW(sqrt(2 * apart(m, r.mean[0])), 2e-7); /* rounded */
             memcpy(m, r.mean[0], sizeof m);
             if (j % 4 == 3)
-                any_direction(w);
+                random_direction_double(w);
             else
                 around(m, fmin(2, 18 * rnd() * (j > 2) / fmax(kappa, 1e-3)), 2 * PI * rnd(), w);
             floats(w, f);
@@ -334,7 +326,7 @@ static void test_what_lies_below_the_horizon_is_mirrored_up(void **state)
         doubles(n, normal);
         for (uint32_t k = 0; k < r.count; ++k)
             assert_true(dot(r.mean[k], normal) > -1e-6);
-        any_direction(w);
+        random_direction_double(w);
         if (dot(w, normal) < 0) {
             floats(w, f);
             BELOW(fabs((double)gkd_pdf(&h, f) / (0.01 * UNIFORM) - 1), 1e-5);
@@ -707,7 +699,7 @@ static void see_ball(gkdi_item *items, uint32_t n, const double source[3], doubl
 {
     for (uint32_t i = 0; i < n; ++i) {
         double p[3], w[3], b[3], l;
-        any_direction(b);
+        random_direction_double(b);
         for (int k = 0; k < 3; ++k) {
             p[k] = half * (2 * rnd() - 1);
             w[k] = source[k] + radius * b[k] - p[k];
@@ -918,7 +910,7 @@ static void test_full_batch_steps_never_lower_the_likelihood(void **state)
         target any = {{{0}}, {0}, {0.25, 0.25, 0.25, 0.25}, 4};
         seed(20 + (uint64_t)i);
         for (int k = 0; k < 4; ++k) {
-            any_direction(any.mean[k]);
+            random_direction_double(any.mean[k]);
             any.kappa[k] = pow(10, 3 * rnd());
         }
         t = of_target(&any);
@@ -1195,7 +1187,7 @@ static void test_mixtures_keep_to_max_lobes(void **state)
     double lights[40][3];
     seed(13);
     for (int k = 0; k < 40; ++k)
-        any_direction(lights[k]);
+        random_direction_double(lights[k]);
     static const uint32_t limits[] = {1, 2, 5, 13, 32};
     for (int i = 0; i < 5; ++i) {
         gkd_desc d = unit_cube();
@@ -1389,7 +1381,7 @@ static void lamp_samples(gkd_training_sample *s, uint32_t n, double low, double 
     for (uint32_t i = 0; i < n; ++i) {
         double x[3] = {rnd(), rnd(), rnd()}, w[3], l, ball[3];
         float p[3], f[3], L;
-        any_direction(ball);
+        random_direction_double(ball);
         for (int k = 0; k < 3; ++k) {
             p[k] = (float)(low + size * x[k]);
             w[k] = (k == 2 ? 3 : 0.5) + 0.1 * ball[k] - x[k];
@@ -1397,7 +1389,7 @@ static void lamp_samples(gkd_training_sample *s, uint32_t n, double low, double 
         l = sqrt(dot(w, w));
         unit(w);
         if (i % 2)
-            any_direction(w);
+            random_direction_double(w);
         floats(w, f);
         L = i % 2 ? 1 : 1000;
         if (outlier && i == n / 2) {

@@ -8,6 +8,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "scale.h"
 #include "scene_internal.h"
 
 #define PI 3.14159265358979323846
@@ -168,7 +169,7 @@ static bool visible(const tr_scene *scene, vec3 p, const tr_light_sample *s)
 /* ---- >>chi -------------------------------------------------------------------------------------------------- */
 
 /* Bins over the cone of half angle acos(1 - width) around an axis, equal in solid angle, and one for the rest. */
-enum { RINGS = 14, SECTORS = 20, BINS = RINGS * SECTORS, SAMPLES = 200000 };
+enum { RINGS = 14, SECTORS = 20, BINS = RINGS * SECTORS, SAMPLES = LESS(200000) };
 typedef struct cone {
     frame3 frame;
     double width; /* 1 - cos of the half angle; 2 = the sphere */

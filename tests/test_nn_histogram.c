@@ -13,8 +13,6 @@
 #define GNN_IMPLEMENTATION
 #include "guide_nn.h"
 
-typedef gnn_range_fn gsd_range_fn; /* crowd.h and counter.h speak of guide_sdtree.h */
-typedef gnn_unet_desc gsd_desc;
 #include "counter.h"
 #include "crowd.h"
 #include "nn_naive.h"
@@ -517,7 +515,7 @@ static void failed_allocations_are_told_and_nothing_leaks(void **state)
     for (long fail = 1; fail <= 5; ++fail) {
         memset(&c, 0, sizeof c);
         c.fail_at = fail;
-        use_counter(&d, &c);
+        count_with(&d, &c);
         gnn_result result = gnn_unet_create(&d, &net);
         assert_int_equal(result, fail <= 2 ? GNN_OUT_OF_MEMORY : GNN_OK);
         if (result == GNN_OK) {

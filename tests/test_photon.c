@@ -12,8 +12,6 @@
 
 #define GPH_IMPLEMENTATION
 #include "guide_photon.h"
-#define GSD_IMPLEMENTATION
-#include "guide_sdtree.h"
 
 #include "chi_square.h"
 #include "counter.h"
@@ -32,21 +30,6 @@ static gph_desc unit_cube(void)
     d.bounds_max[0] = d.bounds_max[1] = d.bounds_max[2] = 1;
     d.grid_cells = 4;
     return d;
-}
-
-static void count_with(gph_desc *d, counter *c)
-{
-    d->allocate = count_allocate;
-    d->release = count_release;
-    d->user = c;
-}
-
-static void random_direction(float d[3])
-{
-    double z = 2 * rnd() - 1, phi = 2 * PI * rnd(), r = sqrt(1 - z * z);
-    d[0] = (float)(r * cos(phi));
-    d[1] = (float)(r * sin(phi));
-    d[2] = (float)z;
 }
 
 static double dot(const float a[3], const float b[3])
@@ -123,7 +106,7 @@ static void record_pass(gph_stream *s[2], uint32_t vertices, uint32_t photons)
     }
 }
 
-static void teach(gph_field *f, int passes, uint32_t vertices, uint32_t photons, gsd_parallel_fn parallel, void *user)
+static void teach(gph_field *f, int passes, uint32_t vertices, uint32_t photons, gph_parallel_fn parallel, void *user)
 {
     gph_stream *s[2];
     OK(gph_stream_create(f, &s[0]));

@@ -11,16 +11,11 @@
 
 #include "bsdf_micro.h"
 #include "emission.h"
+#include "scale.h"
 #include "scene_internal.h"
 #include "threads.h"
 
 #define PI 3.14159265358979323846
-
-#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-#define LESS(n) ((n) / 8)
-#else
-#define LESS(n) (n)
-#endif
 
 /* ---- >>rig -------------------------------------------------------------------------------------------------- */
 

@@ -3,19 +3,13 @@
 
      >>tools >>analytic >>agree >>guided >>splitting >>identical >>misuse */
 #include "cmocka_prelude.h"
+#include "scale.h"
 #include "tracer.h"
 
 #include <stdlib.h>
 #include <string.h>
 
 #define SCENES "examples/scenes/"
-
-/* Sanitizers slow rendering down by an order of magnitude; they look for other things than noise. */
-#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-#define SPP(n) ((n) / 8)
-#else
-#define SPP(n) (n)
-#endif
 
 /* ---- >>tools ------------------------------------------------------------------------------------------------ */
 
@@ -252,7 +246,7 @@ static void furnace_is_white(void **state)
 static void estimators_agree(const char *scene_name, const char *define, const char *value, int spp)
 {
     tr_scene *scene = load(scene_name, define, value);
-    tr_settings s = small("pt", SPP(spp));
+    tr_settings s = small("pt", LESS(spp));
     tr_result mis = render(scene, &s);
     s.no_bsdf_hits = true;
     s.seed = 1;
@@ -260,7 +254,7 @@ static void estimators_agree(const char *scene_name, const char *define, const c
     s.no_bsdf_hits = false;
     s.no_nee = true;
     s.seed = 2;
-    s.spp = 4 * SPP(spp);
+    s.spp = 4 * LESS(spp);
     tr_result bsdf = render(scene, &s);
     assert_agree("MIS and NEE only", &mis, &nee);
     assert_agree("MIS and BSDF only", &mis, &bsdf);
@@ -291,7 +285,7 @@ static void method_agrees_with(const char *method, tr_option *options, int optio
                                const char *define, const char *value, int spp, bool nee, int train)
 {
     tr_scene *scene = load(scene_name, define, value);
-    tr_settings s = small("pt", SPP(spp));
+    tr_settings s = small("pt", LESS(spp));
     s.no_nee = !nee;
     tr_result pt = render(scene, &s);
     s.method = tr_method_find(method);
@@ -433,7 +427,7 @@ static void splitting_changes_no_mean(void **state)
 {
     (void)state;
     tr_scene *scene = load("gloss", "bulb", "0.3");
-    tr_settings s = small("pt", SPP(64));
+    tr_settings s = small("pt", LESS(64));
     tr_result r[2];
     even_method m[2];
     s.method = &even_method_table;

@@ -10,7 +10,6 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <unistd.h>
 
 #define GSD_IMPLEMENTATION
 #include "guide_sdtree.h"
@@ -23,14 +22,6 @@
 #define PI 3.14159265358979323846
 
 /* ---- helpers */
-
-static void random_direction(float d[3])
-{
-    double z = 2 * rnd() - 1, phi = 2 * PI * rnd(), r = sqrt(1 - z * z);
-    d[0] = (float)(r * cos(phi));
-    d[1] = (float)(r * sin(phi));
-    d[2] = (float)z;
-}
 
 static long scaled(long n) { return getenv("GUIDE_TEST_LONG") ? 10 * n : n; }
 
@@ -197,39 +188,6 @@ static void test_documented_defaults_are_the_defaults(void **state)
     assert_int_equal(d.spatial_filter, GSD_SPATIAL_NEAREST);
     assert_int_equal(d.directional_filter, GSD_DIRECTIONAL_BOX);
     assert_int_equal(d.alpha_mode, GSD_ALPHA_GRID);
-}
-
-/* The example in the opening comment compiles as it stands, and runs. */
-static void test_the_example_in_the_comment_compiles(void **state)
-{
-    (void)state;
-    FILE *f = fopen("guide_sdtree.h", "r");
-    const char *root = f ? "." : "..";
-    char line[512], command[1024], source[80], program[64];
-    int lines = 0;
-    f = f ? f : fopen("../guide_sdtree.h", "r");
-    assert_non_null(f);
-    snprintf(program, sizeof program, "/tmp/gsd_example_%ld", (long)getpid());
-    snprintf(source, sizeof source, "%s.c", program);
-    FILE *out = fopen(source, "w");
-    assert_non_null(out);
-    while (fgets(line, sizeof line, f)) {
-        if (!lines && strncmp(line, "       #define GSD_IMPLEMENTATION", 33) != 0)
-            continue;
-        if (strncmp(line, "       ", 7) != 0)
-            break;
-        fputs(line + 7, out);
-        lines++;
-    }
-    fclose(f);
-    fclose(out);
-    assert_true(lines >= 15 && lines <= 25);
-    snprintf(command, sizeof command, "%s -std=c99 -Wall -Wextra -Werror -I%s %s -o %s -lm && %s",
-             getenv("CC") ? getenv("CC") : "cc", root, source, program, program);
-    int status = system(command);
-    remove(source);
-    remove(program);
-    assert_int_equal(status, 0);
 }
 
 static void test_bad_descriptors_are_refused_by_name(void **state)
@@ -2123,7 +2081,7 @@ static int scenario(counter *c)
     d.forest_cells = 3;
     d.alias = true;
     d.target = GSD_TARGET_SIMPLE;
-    use_counter(&d, c);
+    count_with(&d, c);
     seed(1);
     if (gsd_create(&d, &f)) {
         assert_null(f);
@@ -2197,7 +2155,7 @@ static void test_lost_samples_are_counted(void **state)
     gsd_stream *stream;
     static gsd_training_sample s[1000];
     gsd_stats stats;
-    use_counter(&d, &c);
+    count_with(&d, &c);
     OK(gsd_create(&d, &f));
     OK(gsd_stream_create(f, &stream));
     gsd_view v = gsd_get_view(f);
@@ -2221,7 +2179,7 @@ static void test_queries_do_not_allocate(void **state)
     (void)state;
     counter c = {0};
     gsd_desc d = unit_cube(GSD_TARGET_RADIANCE);
-    use_counter(&d, &c);
+    count_with(&d, &c);
     gsd_field *f = train(&d, 2, 2000);
     long before = c.requests;
     gsd_view v = gsd_get_view(f);
@@ -2249,7 +2207,7 @@ static void test_memory_cap_holds_and_the_field_still_learns(void **state)
         d.rho = 0.0005f;
         d.min_samples = 1;
         d.alias = alias;
-        use_counter(&d, &c);
+        count_with(&d, &c);
         gsd_field *f;
         OK(gsd_create(&d, &f));
         size_t peak = 0;
@@ -3038,7 +2996,6 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(test_documented_defaults_are_the_defaults),
-        cmocka_unit_test(test_the_example_in_the_comment_compiles),
         cmocka_unit_test(test_bad_descriptors_are_refused_by_name),
         cmocka_unit_test(test_sizes_are_as_documented),
         cmocka_unit_test(test_pdf_integrates_to_one),

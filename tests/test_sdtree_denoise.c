@@ -955,7 +955,7 @@ static gsd_field *loaded(counter *c, const void *data, size_t size)
 {
     gsd_desc d;
     memset(&d, 0, sizeof d);
-    use_counter(&d, c);
+    count_with(&d, c);
     gsd_field *f;
     OK(gsd_load(&d, data, size, &f));
     return f;

@@ -20,14 +20,6 @@
 
 /* ---- helpers */
 
-static void random_direction(float d[3])
-{
-    double z = 2 * rnd() - 1, phi = 2 * PI * rnd(), r = sqrt(1 - z * z);
-    d[0] = (float)(r * cos(phi));
-    d[1] = (float)(r * sin(phi));
-    d[2] = (float)z;
-}
-
 /* Length up to 0.8; sometimes exactly that, or 0. */
 static void random_offset(float o[3])
 {

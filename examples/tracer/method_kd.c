@@ -38,9 +38,9 @@ static bool parse(parser *p, gkd_desc *d, kd *m)
 {
     int learn, criteria;
     d->split = (gkd_split)(choice(p, "split", "signature|count") + 1);
-    d->split_samples = (uint32_t)number(p, "count", 0);
-    d->lookahead = (uint32_t)number(p, "lookahead", 0);
-    d->min_samples = (uint32_t)number(p, "min_samples", 0);
+    d->split_samples = whole(p, "count", 0);
+    d->lookahead = whole(p, "lookahead", 0);
+    d->min_samples = whole(p, "min_samples", 0);
     d->radiance_step = (float)number(p, "radiance_step", 0);
     d->direction_step = (float)(number(p, "direction_step", 0) * 3.14159265358979 / 180);
     d->confidence = (float)number(p, "confidence", 0);
@@ -51,10 +51,10 @@ static bool parse(parser *p, gkd_desc *d, kd *m)
     d->keep_signatures = (float)number(p, "keep_signatures", 0);
     d->no_prune = choice(p, "prune", "off|on") == 0;
     d->no_rest = choice(p, "rest", "off|on") == 0;
-    d->max_levels = (uint32_t)number(p, "max_levels", 0);
-    d->max_lobes = (uint32_t)number(p, "max_lobes", 0);
-    d->update_samples = (uint32_t)number(p, "update_samples", 0);
-    d->max_bytes = (uint64_t)(number(p, "max_memory_mb", 0) * 1048576.0);
+    d->max_levels = whole(p, "max_levels", 0);
+    d->max_lobes = whole(p, "max_lobes", 0);
+    d->update_samples = whole(p, "update_samples", 0);
+    d->max_bytes = (uint64_t)whole(p, "max_memory_mb", 0) << 20;
     learn = choice(p, "learn_alpha", "off|grid|on");
     d->alpha_mode = (gkd_alpha_mode)(learn == 2 ? GKD_ALPHA_GRID : learn + 1);
     d->alpha = (float)number(p, "alpha", 0);
@@ -62,7 +62,7 @@ static bool parse(parser *p, gkd_desc *d, kd *m)
     d->no_gate = choice(p, "gate", "off|on") == 0;
     d->gate_margin = (float)number(p, "gate_margin", 0);
     d->gate_gain = (float)number(p, "gate_gain", 0);
-    d->gate_probe = (uint32_t)number(p, "gate_probe", 0);
+    d->gate_probe = whole(p, "gate_probe", 0);
     d->simd = (gkd_simd)(choice(p, "simd", "scalar|avx2|avx512|neon") + 1);
     m->product = choice(p, "product", "off|on") != 0;
     m->parallax = choice(p, "parallax", "off|on") != 0;

@@ -61,7 +61,7 @@ static double number(parser *p, const char *key, double fallback)
 }
 
 /* A whole number that fits. */
-static inline uint32_t whole(parser *p, const char *key, uint32_t fallback)
+static uint32_t whole(parser *p, const char *key, uint32_t fallback)
 {
     double x = number(p, key, fallback);
     if (x >= 0 && x <= 4294967295.0 && x == floor(x))

@@ -51,10 +51,10 @@ static bool parse(parser *p, gsd_desc *d, sdtree *m)
     d->split_samples = (float)number(p, "c", 0);
     d->rho = (float)number(p, "rho", 0);
     d->smoothing = (float)number(p, "smoothing", 0);
-    d->max_depth = (uint32_t)number(p, "max_depth", 0);
-    d->max_levels = (uint32_t)number(p, "max_levels", 0);
-    d->min_samples = (uint32_t)number(p, "min_samples", 0);
-    d->max_bytes = (uint64_t)(number(p, "max_memory_mb", 0) * 1048576.0);
+    d->max_depth = whole(p, "max_depth", 0);
+    d->max_levels = whole(p, "max_levels", 0);
+    d->min_samples = whole(p, "min_samples", 0);
+    d->max_bytes = (uint64_t)whole(p, "max_memory_mb", 0) << 20;
     d->spatial_filter = (gsd_spatial_filter)(choice(p, "spatial_filter", "nearest|stochastic") + 1);
     d->directional_filter = (gsd_directional_filter)(choice(p, "directional_filter", "nearest|box") + 1);
     learn = choice(p, "learn_alpha", "off|adam|grid|on");
@@ -64,7 +64,7 @@ static bool parse(parser *p, gsd_desc *d, sdtree *m)
     d->no_gate = choice(p, "gate", "off|on") == 0;
     d->gate_margin = (float)number(p, "gate_margin", 0);
     d->gate_gain = (float)number(p, "gate_gain", 0);
-    d->gate_probe = (uint32_t)number(p, "gate_probe", 0);
+    d->gate_probe = whole(p, "gate_probe", 0);
     d->no_guide_weight = choice(p, "guide_weight", "off|on") == 0;
     d->no_history = choice(p, "history", "off|on") == 0;
     d->denoise = (gsd_denoise_mode)(choice(p, "denoise", "off|on|gaussian") + GSD_DENOISE_OFF);
