@@ -2735,6 +2735,12 @@ GSDI_AVX2_INLINE void gsdi_offset_avx2(const __m256 pivot[4], const __m256 posit
         offset[k] = _mm256_mul_ps(_mm256_and_ps(offset[k], l), f);
 }
 
+/* Which offsets are not zero. */
+GSDI_AVX2_INLINE __m256 gsdi_apart_avx2(const __m256 o[3])
+{
+    return _mm256_cmp_ps(_mm256_or_ps(_mm256_or_ps(o[0], o[1]), o[2]), _mm256_setzero_ps(), _CMP_NEQ_UQ);
+}
+
 /* gsd_to_pivot. */
 GSDI_AVX2_INLINE __m256 gsdi_to_pivot_avx2(const __m256 o[3], const __m256 w[3], __m256 out[3])
 {
@@ -5307,8 +5313,10 @@ GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t
     }
 }
 
-/* Descend up to 64 trees together, one level of each in turn; node[i] ends at a leaf. */
-static void gsdi_descend(const gsd_view *view, uint32_t n, uint32_t *node, uint32_t (*xy)[2], uint32_t *shift)
+/* Descend up to 64 trees together, one level of each in turn; node[i] ends at a leaf. Where a tree ends is anyone's
+   guess: no branches. */
+static void gsdi_descend(const gsd_view *view, uint32_t n, uint32_t *node, const uint32_t *x, const uint32_t *y,
+                         uint32_t *shift)
 {
     uint32_t lane[GSDI_LANES], active = n, i;
     for (i = 0; i < n; ++i)
@@ -5316,49 +5324,111 @@ static void gsdi_descend(const gsd_view *view, uint32_t n, uint32_t *node, uint3
     while (active) {
         uint32_t left = 0;
         for (i = 0; i < active; ++i) {
-            uint32_t l = lane[i], child = view->nodes[node[l]].inner.child, s;
-            if (!child)
-                continue;
-            s = --shift[l];
-            node[l] = child + ((xy[l][0] >> s) & 1u) + 2 * ((xy[l][1] >> s) & 1u);
+            uint32_t l = lane[i], at = node[l], child = view->nodes[at].inner.child, inner = 0u - (child != 0);
+            uint32_t s = --shift[l], next = child + ((x[l] >> s) & 1u) + 2 * ((y[l] >> s) & 1u);
+            node[l] = at ^ ((at ^ next) & inner);
             GSDI_PREFETCH(&view->nodes[node[l]]);
-            lane[left++] = l;
+            lane[left] = l;
+            left -= inner;
         }
         active = left;
     }
 }
 
+/* Up to 64 densities on their way, as arrays. */
+typedef struct gsdi_looks {
+    uint32_t at[GSDI_LANES]; /* index of the query */
+    uint32_t node[GSDI_LANES], x[GSDI_LANES], y[GSDI_LANES], shift[GSDI_LANES];
+    float scale[GSDI_LANES], pdf[GSDI_LANES], even[GSDI_LANES]; /* of the leaf; without a product */
+} gsdi_looks;
+
+/* Coordinates in the quadtree, of queries from i on: one, or eight. */
+static void gsdi_look(gsdi_looks *k, uint32_t i, const gsd_handle *handles, const float *directions, size_t stride)
+{
+    float seen[3];
+    k->scale[i] = gsd_to_pivot(handles[k->at[i]].offset, gsdi_row(directions, stride, k->at[i]), seen);
+    gsd_coordinates(seen, &k->x[i], &k->y[i]);
+}
+
+#if GSDI_X86
+GSDI_AVX2 static void gsdi_look_avx2(gsdi_looks *k, uint32_t i, const gsd_handle *handles, const float *directions,
+                                     size_t stride)
+{
+    const void *row[8];
+    float in[3][8];
+    __m256 offset[4], d[3], scale = _mm256_set1_ps(1);
+    __m256i x, y;
+    uint32_t l, axis;
+    for (l = 0; l < 8; ++l) {
+        const float *direction = gsdi_row(directions, stride, k->at[i + l]);
+        row[l] = &handles[k->at[i + l]].product; /* and offset */
+        for (axis = 0; axis < 3; ++axis)
+            in[axis][l] = direction[axis];
+    }
+    gsdi_columns_avx2(row, offset);
+    for (axis = 0; axis < 3; ++axis)
+        d[axis] = _mm256_loadu_ps(in[axis]);
+    if (_mm256_movemask_ps(gsdi_apart_avx2(offset + 1)))
+        scale = gsdi_to_pivot_avx2(offset + 1, d, d);
+    gsdi_coordinates_avx2(d, &x, &y);
+    _mm256_storeu_ps(&k->scale[i], scale);
+    _mm256_storeu_si256((__m256i *)(void *)&k->x[i], x);
+    _mm256_storeu_si256((__m256i *)(void *)&k->y[i], y);
+}
+
+/* gsd_oriented without a product, of eight. */
+GSDI_AVX2 static void gsdi_even_avx2(const float *pdf, const float *scale, float uniform, float *out)
+{
+    __m256 even = _mm256_set1_ps(uniform * GSD_INV_4PI), leaf = _mm256_loadu_ps(pdf), s = _mm256_loadu_ps(scale), p;
+    p = _mm256_mul_ps(_mm256_max_ps(_mm256_sub_ps(leaf, even), _mm256_setzero_ps()), s);
+    p = _mm256_blendv_ps(_mm256_add_ps(p, even), leaf, _mm256_cmp_ps(s, _mm256_set1_ps(1), _CMP_EQ_OQ));
+    _mm256_storeu_ps(out, p);
+}
+#endif
+
 GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const gsd_handle *handles,
                            const float *directions, size_t direction_stride, float *pdf)
 {
-    uint32_t start, i;
+    uint32_t start, i, eights = 0;
     for (start = 0; start < count; start += GSDI_LANES) {
         uint32_t n = count - start < GSDI_LANES ? count - start : GSDI_LANES;
-        uint32_t node[GSDI_LANES], xy[GSDI_LANES][2], shift[GSDI_LANES];
-        float scale[GSDI_LANES], seen[3];
+        gsdi_looks k;
+        for (i = 0; i < n; ++i)
+            k.at[i] = gsdi_at(index, start + i);
+#if GSDI_X86
+        eights = view->simd >= GSD_SIMD_AVX2 ? n & ~7u : 0;
+        for (i = 0; i < eights; i += 8)
+            gsdi_look_avx2(&k, i, handles, directions, direction_stride);
+#endif
+        for (i = eights; i < n; ++i)
+            gsdi_look(&k, i, handles, directions, direction_stride);
         for (i = 0; i < n; ++i) {
-            uint32_t at = gsdi_at(index, start + i);
-            const gsd_handle *h = &handles[at];
-            scale[i] = gsd_to_pivot(h->offset, gsdi_row(directions, direction_stride, at), seen);
-            gsd_coordinates(seen, &xy[i][0], &xy[i][1]);
-            shift[i] = h->jump;
-            node[i] = h->jump ? h->jump + (xy[i][1] >> 21) * 8 + (xy[i][0] >> 21) : h->root;
+            const gsd_handle *h = &handles[k.at[i]];
+            k.shift[i] = h->jump;
+            k.node[i] = h->jump ? h->jump + (k.y[i] >> 21) * 8 + (k.x[i] >> 21) : h->root;
             if (h->jump)
-                GSDI_PREFETCH(&view->jumps[node[i]]);
+                GSDI_PREFETCH(&view->jumps[k.node[i]]);
             else
-                GSDI_PREFETCH(&view->nodes[node[i]]);
+                GSDI_PREFETCH(&view->nodes[k.node[i]]);
         }
         for (i = 0; i < n; ++i) {
-            if (shift[i]) {
-                node[i] = view->jumps[node[i]];
-                GSDI_PREFETCH(&view->nodes[node[i]]);
+            if (k.shift[i]) {
+                k.node[i] = view->jumps[k.node[i]];
+                GSDI_PREFETCH(&view->nodes[k.node[i]]);
             }
-            shift[i] = shift[i] ? 21 : 24;
+            k.shift[i] = k.shift[i] ? 21 : 24;
         }
-        gsdi_descend(view, n, node, xy, shift);
+        gsdi_descend(view, n, k.node, k.x, k.y, k.shift);
+        for (i = 0; i < n; ++i)
+            k.pdf[i] = view->nodes[k.node[i]].leaf.pdf;
+#if GSDI_X86
+        for (i = 0; i < eights; i += 8)
+            gsdi_even_avx2(&k.pdf[i], &k.scale[i], view->uniform, &k.even[i]);
+#endif
         for (i = 0; i < n; ++i) {
-            uint32_t at = gsdi_at(index, start + i);
-            pdf[at] = gsd_oriented(view, &handles[at], view->nodes[node[i]].leaf.pdf, xy[i][0], xy[i][1], scale[i]);
+            const gsd_handle *h = &handles[k.at[i]];
+            bool done = i < eights && !(h->product > 0);
+            pdf[k.at[i]] = done ? k.even[i] : gsd_oriented(view, h, k.pdf[i], k.x[i], k.y[i], k.scale[i]);
         }
     }
 }
@@ -5459,6 +5529,7 @@ typedef struct gsdi_draws {
     uint32_t node[GSDI_LANES];
     float out[3][GSDI_LANES], pdf[GSDI_LANES];
     float offset[3][GSDI_LANES], scale[GSDI_LANES]; /* of the handle; of gsd_to_pivot */
+    float even[GSDI_LANES];                         /* density without a product */
     uint32_t edge[GSDI_LANES];                      /* not 0: near the leaf's edge */
     uint32_t deep[GSDI_LANES];                      /* not 0: the leaf lies within one bin */
 } gsdi_draws;
@@ -5614,7 +5685,10 @@ GSDI_AVX2 static void gsdi_directions_avx2(gsdi_draws *d, uint32_t lane)
         w[k] = _mm256_mul_ps(w[k], l);
         _mm256_storeu_ps(&d->out[k][lane], w[k]);
     }
-    _mm256_storeu_ps(&d->scale[lane], gsdi_to_pivot_avx2(o, w, w));
+    l = one;
+    if (_mm256_movemask_ps(gsdi_apart_avx2(o)))
+        l = gsdi_to_pivot_avx2(o, w, w);
+    _mm256_storeu_ps(&d->scale[lane], l);
 }
 
 static bool gsdi_aliased(const gsd_handle *h) { return h->alias_count && !(h->product > 0); }
@@ -5629,6 +5703,7 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
     bool aliased = gsdi_aliased(&handles[at[0]]), done[GSDI_LANES / 8];
     uint32_t lanes = (n + 7) & ~7u, left = aliased ? 0 : lanes, i, k; /* those from n on repeat the first */
     for (i = 0; i < lanes; ++i) {
+        const gsd_handle *h = &handles[at[i < n ? i : 0]];
         const float *v = gsdi_row(u, u_stride, at[i < n ? i : 0]);
         for (k = 0; k < 2; ++k) {
             int32_t b = (int32_t)(v[k] * 16777216.0f);
@@ -5636,11 +5711,12 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
             d.lo[k][i] = 0;
             d.width[k][i] = 1;
         }
-        done[i / 8] = false;
         for (k = 0; k < 3; ++k)
-            d.offset[k][i] = handles[at[i < n ? i : 0]].offset[k];
-        d.node[i] = handles[at[i < n ? i : 0]].root;
-        GSDI_PREFETCH(&view->nodes[d.node[i]]);
+            d.offset[k][i] = h->offset[k];
+        d.node[i] = h->root;
+        done[i / 8] = false;
+        if (!aliased)
+            GSDI_PREFETCH(&view->nodes[d.node[i]]);
     }
     gsdi_extend_avx2(&d, lanes, e);
     for (i = 0; !aliased && i < n; ++i) { /* the steps of gsd_choose_bin and gsd_leave_bin, with a prefetch between */
@@ -5695,6 +5771,7 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
     for (i = 0; i < lanes; i += 8) {
         gsdi_leaves_avx2(view->nodes, &d, i);
         gsdi_directions_avx2(&d, i);
+        gsdi_even_avx2(&d.pdf[i], &d.scale[i], view->uniform, &d.even[i]);
     }
     for (i = 0; i < n; ++i) {
         const gsd_handle *h = &handles[at[i]];
@@ -5707,6 +5784,8 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
             out[k] = d.out[k][i];
         if (d.edge[i] || (h->product > 0 && !d.deep[i]))
             pdf[at[i]] = gsd_pdf(view, h, out);
+        else if (!(h->product > 0))
+            pdf[at[i]] = d.even[i];
         else
             pdf[at[i]] = gsd_oriented(view, h, d.pdf[i], (uint32_t)d.r[0][i], (uint32_t)d.r[1][i], d.scale[i]);
     }
