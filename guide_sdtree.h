@@ -38,7 +38,8 @@
      >>types     descriptor, sample, results   >>batch   find, sample, pdf of arrays
      >>field     create, refine, stats         >>store   save, load, merge, export, import
      implementation:
-     >>memory  >>math  >>streams  >>trees  >>denoise  >>gaussian  >>accumulate  >>gate  >>block  >>refine  >>life
+     >>memory  >>math  >>streams  >>trees  >>denoise  >>gaussian  >>lanes  >>accumulate  >>gate  >>block  >>refine
+   >>life
      >>forest  >>batches  >>files  >>check  >>plain  >>licence
 
    HOW IT WORKS
@@ -157,9 +158,10 @@
      after rounding (depth 20: 2 %, depth 12: 0.006 %): gsd_sample returns the density of the rounded direction, the
      same as gsd_pdf for it, but for some 4e-6 of directions near the poles of trees of depth 20 with parallax. phi is
      computed to 4e-8 rad. SIMD levels differ from scalar by <= 2e-6 relative (4e-6 with parallax), and by the
-     neighbour's density for about 1e-6 of directions within rounding of a leaf's edge. accumulate and refine use one
-     code path for all levels, but for the matrices of GSD_DENOISE_GAUSSIAN: they differ by <= 1e-6 relative, so that
-     a node within that of the threshold is divided at one level and not at another.
+     neighbour's density for about 1e-6 of directions within rounding of a leaf's edge. accumulate and refine give the
+     same bits at all levels (not with clang's -ffp-contract=fast, nor with -ffast-math), but for the matrices of
+     GSD_DENOISE_GAUSSIAN: they differ by <= 1e-6 relative, so that a node within that of the threshold is divided at
+     one level and not at another.
 
    REFERENCES
      T. Mueller, M. Gross, J. Novak 2017, Practical Path Guiding for Efficient Light-Transport Simulation.
@@ -538,6 +540,10 @@ GSD_API gsd_result gsd_import_trees(gsd_field *field, const gsd_tree *trees, uin
 /* ---- >>query ------------------------------------------------------------------------------------------------ */
 
 #define GSD_INV_4PI 0.07957747154594766788f
+
+#if defined(__clang__) /* accumulate asks them too: see the implementation */
+#pragma STDC FP_CONTRACT OFF
+#endif
 
 /* Direction (unit, any finite) to 24-bit coordinates: x = phi / (2 pi), y = (z + 1) / 2. Polynomial: minimax fit of
    atan(t) / (2 pi) on 0 .. 1, error 6e-9 turns. Total function: NaN gives some valid coordinate. [any thread] */
@@ -1001,6 +1007,10 @@ GSD_QUERY gsd_training_sample gsd_make_sample(const float position[3], const flo
                                   pdf_bsdf, pdf_guide);
 }
 
+#if defined(__clang__)
+#pragma STDC FP_CONTRACT DEFAULT
+#endif
+
 /* ---- >>batch ------------------------------------------------------------------------------------------------ */
 
 /* The queries for arrays: several in flight at once, so that memory latency overlaps. index lists the entries to
@@ -1052,8 +1062,10 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #endif
 #if defined(__GNUC__) && !defined(__clang__)
 #define GSDI_UNROLL _Pragma("GCC unroll 4")
+#define GSDI_FLATTEN __attribute__((flatten)) /* inline queries are inlined, and so not contracted either */
 #else
 #define GSDI_UNROLL
+#define GSDI_FLATTEN
 #endif
 #if defined(__GNUC__) || defined(__clang__)
 #define GSDI_PREFETCH(p) __builtin_prefetch(p)
@@ -2607,6 +2619,169 @@ static void gsdi_gauss_normalise(const uint32_t *child, double *mass, uint32_t c
     }
 }
 
+/* ---- >>lanes ------------------------------------------------------------------------------------------------ */
+
+/* Eight at a time what the inline queries do one by one, in the same operations and thus the same bits: sums, products,
+   quotients and roots are rounded alike everywhere, and nothing is contracted here. */
+#if GSDI_X86
+#define GSDI_AVX2 __attribute__((target("avx2")))
+#define GSDI_AVX2_INLINE __attribute__((always_inline)) GSDI_AVX2 static inline
+
+/* Eight rows of four floats in columns. */
+GSDI_AVX2_INLINE void gsdi_columns_avx2(const void *const at[8], __m256 column[4])
+{
+    __m256 row[4], t[4];
+    uint32_t i;
+    for (i = 0; i < 4; ++i)
+        row[i] = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps((const float *)at[i])),
+                                      _mm_loadu_ps((const float *)at[i + 4]), 1);
+    t[0] = _mm256_unpacklo_ps(row[0], row[1]);
+    t[1] = _mm256_unpackhi_ps(row[0], row[1]);
+    t[2] = _mm256_unpacklo_ps(row[2], row[3]);
+    t[3] = _mm256_unpackhi_ps(row[2], row[3]);
+    column[0] = _mm256_shuffle_ps(t[0], t[2], 0x44);
+    column[1] = _mm256_shuffle_ps(t[0], t[2], 0xee);
+    column[2] = _mm256_shuffle_ps(t[1], t[3], 0x44);
+    column[3] = _mm256_shuffle_ps(t[1], t[3], 0xee);
+}
+
+GSDI_AVX2_INLINE __m256 gsdi_dot_avx2(const __m256 a[3], const __m256 b[3])
+{
+    __m256 xy = _mm256_add_ps(_mm256_mul_ps(a[0], b[0]), _mm256_mul_ps(a[1], b[1]));
+    return _mm256_add_ps(xy, _mm256_mul_ps(a[2], b[2]));
+}
+
+GSDI_AVX2_INLINE __m256 gsdi_absolute_avx2(__m256 x) { return _mm256_andnot_ps(_mm256_set1_ps(-0.0f), x); }
+
+/* The end of gsd_direction: z, and phi as q quarter turns and f turns. */
+GSDI_AVX2_INLINE void gsdi_direction_avx2(__m256 f, __m256i q, __m256 z, __m256 out[3])
+{
+    __m256 g = _mm256_mul_ps(f, f), one = _mm256_set1_ps(1), s, c, r, odd, a;
+    s = _mm256_add_ps(_mm256_set1_ps(81.5880703f), _mm256_mul_ps(g, _mm256_set1_ps(-75.2377448f)));
+    s = _mm256_add_ps(_mm256_set1_ps(-41.3416277f), _mm256_mul_ps(g, s));
+    s = _mm256_mul_ps(f, _mm256_add_ps(_mm256_set1_ps(6.28318522f), _mm256_mul_ps(g, s)));
+    c = _mm256_add_ps(_mm256_set1_ps(-85.4436999f), _mm256_mul_ps(g, _mm256_set1_ps(59.2443711f)));
+    c = _mm256_add_ps(_mm256_set1_ps(64.9393261f), _mm256_mul_ps(g, c));
+    c = _mm256_add_ps(_mm256_set1_ps(-19.7392087f), _mm256_mul_ps(g, c));
+    c = _mm256_add_ps(one, _mm256_mul_ps(g, c));
+    z = _mm256_min_ps(_mm256_max_ps(z, _mm256_set1_ps(-1)), one);
+    r = _mm256_sqrt_ps(_mm256_mul_ps(_mm256_sub_ps(one, z), _mm256_add_ps(one, z)));
+    odd = _mm256_castsi256_ps(_mm256_slli_epi32(q, 31));
+    a = _mm256_blendv_ps(c, _mm256_xor_ps(s, _mm256_set1_ps(-0.0f)), odd);
+    s = _mm256_blendv_ps(s, c, odd);
+    r = _mm256_xor_ps(r, _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_srli_epi32(q, 1), 31)));
+    out[0] = _mm256_mul_ps(r, a);
+    out[1] = _mm256_mul_ps(r, s);
+    out[2] = z;
+}
+
+/* gsd_direction in the middle of 24-bit coordinates. What that has in double is exact in float: 2 x + 1 - 2^23 q has
+   23 bits, 2 y + 1 - 2^24 is odd and has 24. */
+GSDI_AVX2_INLINE void gsdi_middle_avx2(__m256i x, __m256i y, __m256 out[3])
+{
+    __m256i q = _mm256_srli_epi32(_mm256_add_epi32(x, _mm256_set1_epi32(2097152)), 22), one = _mm256_set1_epi32(1);
+    __m256i f = _mm256_sub_epi32(_mm256_add_epi32(_mm256_add_epi32(x, x), one), _mm256_slli_epi32(q, 23));
+    __m256i z = _mm256_sub_epi32(_mm256_add_epi32(y, y), _mm256_set1_epi32(16777215));
+    gsdi_direction_avx2(_mm256_mul_ps(_mm256_cvtepi32_ps(f), _mm256_set1_ps(2.98023223876953125e-8f)), q,
+                        _mm256_mul_ps(_mm256_cvtepi32_ps(z), _mm256_set1_ps(5.9604644775390625e-8f)), out);
+}
+
+/* gsd_coordinates. */
+GSDI_AVX2_INLINE void gsdi_coordinates_avx2(const __m256 d[3], __m256i *x, __m256i *y)
+{
+    __m256 ax = gsdi_absolute_avx2(d[0]), ay = gsdi_absolute_avx2(d[1]), zero = _mm256_setzero_ps(), t, s, q, p, z;
+    __m256 big = _mm256_max_ps(ax, ay);
+    __m256i i, swap = _mm256_castps_si256(_mm256_cmp_ps(ay, ax, _CMP_GT_OQ));
+    __m256i left = _mm256_castps_si256(_mm256_cmp_ps(d[0], zero, _CMP_LT_OQ));
+    __m256i below = _mm256_castps_si256(_mm256_cmp_ps(d[1], zero, _CMP_LT_OQ));
+    t = _mm256_and_ps(_mm256_div_ps(_mm256_min_ps(ay, ax), big), _mm256_cmp_ps(big, zero, _CMP_GT_OQ));
+    s = _mm256_mul_ps(t, t);
+    q = _mm256_mul_ps(s, s);
+    p = _mm256_sub_ps(_mm256_set1_ps(0.003479549227f), _mm256_mul_ps(_mm256_set1_ps(0.0006452896099f), s));
+    p = _mm256_mul_ps(q, p);
+    p = _mm256_add_ps(_mm256_sub_ps(_mm256_set1_ps(0.01534600094f), _mm256_mul_ps(_mm256_set1_ps(0.008898663359f), s)),
+                      p);
+    z = _mm256_sub_ps(_mm256_set1_ps(0.03174594614f), _mm256_mul_ps(_mm256_set1_ps(0.02213626529f), s));
+    p = _mm256_mul_ps(q, _mm256_add_ps(z, _mm256_mul_ps(q, p)));
+    z = _mm256_sub_ps(_mm256_set1_ps(0.1591548374f), _mm256_mul_ps(_mm256_set1_ps(0.05304612139f), s));
+    p = _mm256_max_ps(_mm256_mul_ps(_mm256_add_ps(z, p), t), zero);
+    i = _mm256_cvttps_epi32(_mm256_mul_ps(_mm256_min_ps(p, _mm256_set1_ps(0.125f)), _mm256_set1_ps(67108864.0f)));
+    i = _mm256_sub_epi32(_mm256_xor_si256(i, swap), swap);
+    i = _mm256_add_epi32(i, _mm256_and_si256(swap, _mm256_set1_epi32(16777216)));
+    i = _mm256_sub_epi32(_mm256_xor_si256(i, left), left);
+    i = _mm256_add_epi32(i, _mm256_and_si256(left, _mm256_set1_epi32(33554432)));
+    i = _mm256_add_epi32(_mm256_xor_si256(i, below), _mm256_and_si256(below, _mm256_set1_epi32(67108864)));
+    *x = _mm256_and_si256(_mm256_srli_epi32(i, 2), _mm256_set1_epi32(0xffffff));
+    z = _mm256_min_ps(_mm256_max_ps(d[2], _mm256_set1_ps(-1)), _mm256_set1_ps(1));
+    i = _mm256_cvttps_epi32(_mm256_mul_ps(_mm256_add_ps(z, _mm256_set1_ps(1)), _mm256_set1_ps(8388608.0f)));
+    *y = _mm256_min_epi32(i, _mm256_set1_epi32(16777215));
+}
+
+/* gsd_offset; pivot: with nearness. */
+GSDI_AVX2_INLINE void gsdi_offset_avx2(const __m256 pivot[4], const __m256 position[3], __m256 offset[3])
+{
+    __m256 l, f, near, most = _mm256_set1_ps(GSD_MOST_OFFSET), one = _mm256_set1_ps(1);
+    uint32_t k;
+    for (k = 0; k < 3; ++k)
+        offset[k] = _mm256_mul_ps(_mm256_sub_ps(position[k], pivot[k]), pivot[3]);
+    l = gsdi_dot_avx2(offset, offset);
+    near = _mm256_cmp_ps(l, _mm256_set1_ps(GSD_MOST_OFFSET * GSD_MOST_OFFSET), _CMP_LE_OQ);
+    if (_mm256_movemask_ps(near) == 255)
+        return;
+    f = _mm256_div_ps(most, _mm256_sqrt_ps(l));
+    l = _mm256_cmp_ps(l, _mm256_set1_ps(1e30f), _CMP_LT_OQ);
+    f = _mm256_blendv_ps(_mm256_and_ps(f, l), one, near);
+    for (k = 0; k < 3; ++k)
+        offset[k] = _mm256_mul_ps(_mm256_and_ps(offset[k], l), f);
+}
+
+/* Which offsets are not zero. */
+GSDI_AVX2_INLINE __m256 gsdi_apart_avx2(const __m256 o[3])
+{
+    return _mm256_cmp_ps(_mm256_or_ps(_mm256_or_ps(o[0], o[1]), o[2]), _mm256_setzero_ps(), _CMP_NEQ_UQ);
+}
+
+/* gsd_to_pivot. */
+GSDI_AVX2_INLINE __m256 gsdi_to_pivot_avx2(const __m256 o[3], const __m256 w[3], __m256 out[3])
+{
+    __m256 one = _mm256_set1_ps(1), b = gsdi_dot_avx2(o, w), s, t;
+    uint32_t k;
+    s = _mm256_sqrt_ps(_mm256_add_ps(_mm256_sub_ps(one, gsdi_dot_avx2(o, o)), _mm256_mul_ps(b, b)));
+    t = _mm256_sub_ps(s, b);
+    for (k = 0; k < 3; ++k)
+        out[k] = _mm256_add_ps(o[k], _mm256_mul_ps(t, w[k]));
+    t = _mm256_div_ps(_mm256_mul_ps(t, t), s);
+    return _mm256_blendv_ps(one, t, _mm256_cmp_ps(t, _mm256_set1_ps(8), _CMP_LT_OQ));
+}
+
+/* gsd_unpack_normal of what has one. */
+GSDI_AVX2_INLINE void gsdi_normal_avx2(__m256i x, __m256i y, __m256 n[3])
+{
+    __m256 middle = _mm256_set1_ps(128), unit = _mm256_set1_ps(127), sign = _mm256_set1_ps(-0.0f), t;
+    n[0] = _mm256_div_ps(_mm256_sub_ps(_mm256_cvtepi32_ps(_mm256_srli_epi32(x, 24)), middle), unit);
+    n[1] = _mm256_div_ps(_mm256_sub_ps(_mm256_cvtepi32_ps(_mm256_srli_epi32(y, 24)), middle), unit);
+    n[2] = _mm256_sub_ps(_mm256_set1_ps(1), gsdi_absolute_avx2(n[0]));
+    n[2] = _mm256_sub_ps(n[2], gsdi_absolute_avx2(n[1]));
+    t = _mm256_min_ps(n[2], _mm256_setzero_ps());
+    n[0] = _mm256_add_ps(n[0], _mm256_xor_ps(t, _mm256_and_ps(n[0], sign)));
+    n[1] = _mm256_add_ps(n[1], _mm256_xor_ps(t, _mm256_and_ps(n[1], sign)));
+    t = _mm256_div_ps(_mm256_set1_ps(1), _mm256_sqrt_ps(gsdi_dot_avx2(n, n)));
+    n[0] = _mm256_mul_ps(n[0], t);
+    n[1] = _mm256_mul_ps(n[1], t);
+    n[2] = _mm256_mul_ps(n[2], t);
+}
+
+/* gsd_bin_cosine from b, the means of the bins' directions. */
+GSDI_AVX2_INLINE __m256 gsdi_cosine_avx2(const __m256 normal[3], const __m256 b[3], __m256 lift)
+{
+    __m256 h = _mm256_set1_ps(GSD_HORIZON), zero = _mm256_setzero_ps(), r, above;
+    __m256 t = _mm256_sub_ps(gsdi_dot_avx2(normal, b), lift);
+    r = _mm256_min_ps(_mm256_max_ps(_mm256_add_ps(t, h), zero), _mm256_set1_ps(2 * GSD_HORIZON));
+    above = _mm256_add_ps(_mm256_max_ps(_mm256_sub_ps(t, h), zero), _mm256_set1_ps(GSD_BELOW));
+    return _mm256_add_ps(_mm256_mul_ps(_mm256_mul_ps(r, r), _mm256_set1_ps(0.25f / GSD_HORIZON)), above);
+}
+#endif
+
 /* ---- >>accumulate ------------------------------------------------------------------------------------------- */
 
 /* What accumulate keeps of a sample while it sorts. 36 bytes. */
@@ -2653,6 +2828,22 @@ static bool gsdi_sample_valid(const gsd_training_sample *s)
            gsdi_finite(s->position[0] + s->position[1] + s->position[2]);
 }
 
+/* The cell that a sample of the cell at g is added to. */
+static uint32_t gsdi_target(const gsdi_accumulation *a, const gsd_training_sample *s, uint32_t cell,
+                            const uint32_t g[3])
+{
+    uint32_t level = a->view.cells[cell].level, jittered[3], axis;
+    double u[3];
+    if (!a->stochastic)
+        return cell;
+    gsdi_sample_random(s, u);
+    for (axis = 0; axis < 3; ++axis) {
+        double t = (double)g[axis] + (u[axis] - 0.5) * (double)gsd_cell_extent(level, axis);
+        jittered[axis] = t <= 0 ? 0 : t < 16777215.0 ? (uint32_t)t : 16777215u;
+    }
+    return gsd_cell_at(&a->view, jittered);
+}
+
 /* Cells of a sample: where it lies and where it is added. Sets the item's bin. False: no such cell. */
 static bool gsdi_locate(gsdi_accumulation *a, const gsd_training_sample *s, uint32_t at, gsdi_item *item,
                         gsdi_segment *segment)
@@ -2672,20 +2863,12 @@ static bool gsdi_locate(gsdi_accumulation *a, const gsd_training_sample *s, uint
     }
     segment->clamped += outside;
     cell = gsd_cell_at(view, g);
-    a->read_cell[at] = a->target_cell[at] = cell;
     level = view->cells[cell].level;
     for (axis = 0; axis < 3; ++axis)
         bin = bin << 2 | ((g[axis] >> (22 - (level + 2 - axis) / 3)) & 3u);
     item->x |= bin << 24;
-    if (a->stochastic) {
-        double u[3];
-        gsdi_sample_random(s, u);
-        for (axis = 0; axis < 3; ++axis) {
-            double t = (double)g[axis] + (u[axis] - 0.5) * (double)gsd_cell_extent(level, axis);
-            g[axis] = t <= 0 ? 0 : t < 16777215.0 ? (uint32_t)t : 16777215u;
-        }
-        a->target_cell[at] = gsd_cell_at(view, g);
-    }
+    a->read_cell[at] = cell;
+    a->target_cell[at] = gsdi_target(a, s, cell, g);
     return true;
 }
 
@@ -2700,18 +2883,26 @@ static float gsdi_sample_pdf(const gsdi_accumulation *a, const gsd_training_samp
     return gsd_pdf(&a->view, &handle, direction);
 }
 
-/* A sample that is not zero as its quadtree sees it: coordinates, value per solid angle there, without the cosine,
-   which is multiplied in when sampling. */
-static void gsdi_see(const gsdi_accumulation *a, const gsd_training_sample *s, uint32_t at, gsdi_item *item)
+/* What a sample that is not zero needs besides: the guide's density, where nobody gave it. */
+static void gsdi_see_guide(const gsdi_accumulation *a, const gsd_training_sample *s, uint32_t cell, gsdi_item *item)
 {
-    const gsdi_state *state = &a->field->states[a->target_cell[at]];
-    float direction[3], seen[3], offset[3] = {0, 0, 0}, normal[3], scale = 1;
+    float direction[3], normal[3];
+    if (item->pdf_guide > 0 || !(a->judge || (a->second_moment && !a->field->desc.no_guide_weight)))
+        return;
     gsd_unpack_normal(s->direction, normal);
     gsd_direction((double)(s->direction[0] & 0xffffffu) + 0.5, (double)(s->direction[1] & 0xffffffu) + 0.5, direction);
-    if (!(item->pdf_guide > 0) && (a->judge || (a->second_moment && !a->field->desc.no_guide_weight)))
-        item->pdf_guide = gsdi_sample_pdf(a, s, a->read_cell[at], direction, normal);
+    item->pdf_guide = gsdi_sample_pdf(a, s, cell, direction, normal);
+}
+
+/* A sample that is not zero as its quadtree sees it: coordinates, value per solid angle there, without the cosine,
+   which is multiplied in when sampling. */
+GSDI_FLATTEN static void gsdi_see(const gsdi_accumulation *a, const gsd_training_sample *s, const gsdi_state *state,
+                                  gsdi_item *item)
+{
+    float direction[3], seen[3], offset[3] = {0, 0, 0}, normal[3], scale = 1;
     if (state->nearness > 0) { /* never in a forest */
         uint32_t bin = item->x & 0xff000000u;
+        gsd_direction((double)(item->x & 0xffffffu) + 0.5, (double)item->y + 0.5, direction);
         gsd_offset(state->pivot, state->nearness, s->position, offset);
         scale = gsd_to_pivot(offset, direction, seen);
         gsd_coordinates(seen, &item->x, &item->y);
@@ -2719,11 +2910,272 @@ static void gsdi_see(const gsdi_accumulation *a, const gsd_training_sample *s, u
     }
     if (!a->second_moment)
         return;
-    if (s->direction[0] >> 24)
+    if (s->direction[0] >> 24) {
+        gsd_unpack_normal(s->direction, normal);
         item->value /=
             gsd_bin_cosine(&a->view, normal, gsd_lift(offset, normal), (item->y >> 21) * 8 + (item->x >> 21 & 7u));
+    }
     item->value /= sqrtf(scale); /* it will be squared */
 }
+
+#if GSDI_X86
+/* The values of second moments in gsdi_see. */
+GSDI_AVX2_INLINE __m256 gsdi_without_cosine_avx2(const gsd_view *view, const __m256i packed[2], __m256i x, __m256i y,
+                                                 const __m256 offset[3], __m256 scale, __m256 value)
+{
+    __m256 normal[3], mean[3], cosine, none;
+    __m256i bin = _mm256_add_epi32(_mm256_slli_epi32(_mm256_srli_epi32(y, 21), 3), _mm256_srli_epi32(x, 21));
+    uint32_t k;
+    gsdi_normal_avx2(packed[0], packed[1], normal);
+    for (k = 0; k < 3; ++k)
+        mean[k] = _mm256_i32gather_ps(view->bins + k * GSDI_BINS, bin, 4);
+    cosine = gsdi_cosine_avx2(normal, mean, gsdi_dot_avx2(offset, normal));
+    none = _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_srli_epi32(packed[0], 24), _mm256_setzero_si256()));
+    value = _mm256_blendv_ps(_mm256_div_ps(value, cosine), value, none);
+    return _mm256_div_ps(value, _mm256_sqrt_ps(scale));
+}
+
+/* gsdi_see for n <= 8 samples of a segment. */
+GSDI_AVX2 static void gsdi_see_avx2(const gsdi_accumulation *a, const gsdi_segment *segment, const uint32_t *lane,
+                                    uint32_t n)
+{
+    const void *pivot_at[8], *sample_at[8];
+    uint32_t coordinate[2][8], i;
+    float value[8];
+    __m256 offset[3], position[4], pivot[4], direction[3], scale = _mm256_set1_ps(1), far;
+    __m256i packed[2], x, y, seen[2], wide = _mm256_set1_epi32(0xffffff);
+    for (i = 0; i < 8; ++i) { /* those from n on repeat the first */
+        uint32_t k = lane[i < n ? i : 0], at = segment->base + k;
+        sample_at[i] = segment->samples[k].position; /* and direction[0] */
+        coordinate[1][i] = segment->samples[k].direction[1];
+        pivot_at[i] = a->field->states[a->target_cell[at]].pivot; /* and nearness */
+        value[i] = a->items[at].value;
+    }
+    gsdi_columns_avx2(sample_at, position);
+    gsdi_columns_avx2(pivot_at, pivot);
+    packed[0] = _mm256_castps_si256(position[3]);
+    packed[1] = _mm256_loadu_si256((const __m256i *)(const void *)coordinate[1]);
+    x = _mm256_and_si256(packed[0], wide);
+    y = _mm256_and_si256(packed[1], wide);
+    far = _mm256_cmp_ps(pivot[3], _mm256_setzero_ps(), _CMP_LE_OQ);
+    offset[0] = offset[1] = offset[2] = _mm256_setzero_ps();
+    if (_mm256_movemask_ps(far) != 255) {
+        gsdi_middle_avx2(x, y, direction);
+        gsdi_offset_avx2(pivot, position, offset);
+        scale = gsdi_to_pivot_avx2(offset, direction, direction);
+        gsdi_coordinates_avx2(direction, &seen[0], &seen[1]);
+        x = _mm256_blendv_epi8(seen[0], x, _mm256_castps_si256(far));
+        y = _mm256_blendv_epi8(seen[1], y, _mm256_castps_si256(far));
+    }
+    if (a->second_moment)
+        _mm256_storeu_ps(value,
+                         gsdi_without_cosine_avx2(&a->view, packed, x, y, offset, scale, _mm256_loadu_ps(value)));
+    _mm256_storeu_si256((__m256i *)(void *)coordinate[0], x);
+    _mm256_storeu_si256((__m256i *)(void *)coordinate[1], y);
+    for (i = 0; i < n; ++i) {
+        gsdi_item *item = &a->items[segment->base + lane[i]];
+        item->x = (item->x & 0xff000000u) | coordinate[0][i];
+        item->y = coordinate[1][i];
+        item->value = value[i];
+    }
+}
+#endif
+
+static void gsdi_see_lanes(const gsdi_accumulation *a, const gsdi_segment *segment, const uint32_t *lane, uint32_t n)
+{
+    uint32_t i;
+#if GSDI_X86
+    if (a->view.simd >= GSD_SIMD_AVX2) {
+        gsdi_see_avx2(a, segment, lane, n);
+        return;
+    }
+#endif
+    for (i = 0; i < n; ++i) {
+        uint32_t at = segment->base + lane[i];
+        gsdi_see(a, &segment->samples[lane[i]], &a->field->states[a->target_cell[at]], &a->items[at]);
+    }
+}
+
+/* See those of a segment's samples that are not zero. */
+static void gsdi_see_segment(const gsdi_accumulation *a, const gsdi_segment *segment)
+{
+    uint32_t lane[8], n = 0, i;
+    for (i = 0; i < segment->count; ++i) {
+        const gsd_training_sample *s = &segment->samples[i];
+        const gsdi_state *state;
+        uint32_t at = segment->base + i;
+        gsdi_item *item = &a->items[at];
+        if (a->read_cell[at] == GSDI_NONE || !(item->contribution > 0 || item->value > 0))
+            continue;
+        gsdi_see_guide(a, s, a->read_cell[at], item);
+        state = &a->field->states[a->target_cell[at]];
+        if (!(state->nearness > 0) && !(a->second_moment && s->direction[0] >> 24))
+            continue; /* seen from anywhere alike */
+        lane[n++] = i;
+        if (n == 8) {
+            gsdi_see_lanes(a, segment, lane, n);
+            n = 0;
+        }
+    }
+    if (n)
+        gsdi_see_lanes(a, segment, lane, n);
+}
+
+/* Check sample i of a segment, find its cells and leaf coordinates. */
+static void gsdi_read(gsdi_accumulation *a, gsdi_segment *segment, uint32_t i)
+{
+    const gsd_training_sample *s = &segment->samples[i];
+    uint32_t at = segment->base + i;
+    gsdi_item *item = &a->items[at];
+    bool rejected = s->radiance == 0 && signbit(s->radiance);
+    item->x = s->direction[0] & 0xffffffu;
+    item->y = s->direction[1] & 0xffffffu;
+    if (!gsdi_sample_valid(s) || !gsdi_locate(a, s, at, item, segment)) {
+        segment->refused++;
+        a->read_cell[at] = a->target_cell[at] = GSDI_NONE;
+        return;
+    }
+    item->nearness = s->nearness < a->nearest ? s->nearness : a->nearest;
+    item->value = a->target == GSD_TARGET_RADIANCE ? s->radiance
+                  : a->target == GSD_TARGET_SIMPLE ? s->contribution
+                                                   : s->pixel_contribution;
+    item->value = rejected ? 0 : item->value;
+    item->contribution = rejected ? 0 : s->contribution;
+    item->pixel = rejected ? 0 : s->pixel_contribution;
+    item->pdf_mix = s->pdf_mix;
+    item->pdf_bsdf = s->pdf_bsdf;
+    item->pdf_guide = s->pdf_guide;
+    GSDI_PREFETCH(&a->field->states[a->target_cell[at]].pivot);
+    segment->rejected += rejected;
+    segment->zeros += !(s->radiance > 0) || !(s->contribution > 0);
+}
+
+#if GSDI_X86
+/* 0 <= x < most; x <= most */
+GSDI_AVX2_INLINE __m256 gsdi_below_avx2(__m256 x, __m256 most)
+{
+    return _mm256_and_ps(_mm256_cmp_ps(x, _mm256_setzero_ps(), _CMP_GE_OQ), _mm256_cmp_ps(x, most, _CMP_LT_OQ));
+}
+GSDI_AVX2_INLINE __m256 gsdi_upto_avx2(__m256 x, __m256 most)
+{
+    return _mm256_and_ps(_mm256_cmp_ps(x, _mm256_setzero_ps(), _CMP_GE_OQ), _mm256_cmp_ps(x, most, _CMP_LE_OQ));
+}
+
+/* gsdi_sample_valid; s: the words of gsd_training_sample. */
+GSDI_AVX2_INLINE __m256 gsdi_valid_avx2(const __m256 s[12])
+{
+    __m256 most = _mm256_set1_ps(GSDI_MAX_VALUE), finite = _mm256_set1_ps(3.4028234e38f), ok;
+    ok = _mm256_and_ps(gsdi_below_avx2(s[6], most), gsdi_below_avx2(s[7], most));
+    ok = _mm256_and_ps(ok, gsdi_below_avx2(s[8], most));
+    ok = _mm256_and_ps(ok, _mm256_cmp_ps(s[9], _mm256_setzero_ps(), _CMP_GT_OQ));
+    ok = _mm256_and_ps(ok, _mm256_cmp_ps(s[9], finite, _CMP_LE_OQ));
+    ok = _mm256_and_ps(ok, _mm256_and_ps(gsdi_upto_avx2(s[10], finite), gsdi_upto_avx2(s[11], finite)));
+    ok = _mm256_and_ps(ok, gsdi_upto_avx2(s[5], finite));
+    ok = _mm256_and_ps(ok, _mm256_cmp_ps(s[6], _mm256_mul_ps(most, s[9]), _CMP_LT_OQ));
+    return _mm256_and_ps(
+        ok, _mm256_cmp_ps(gsdi_absolute_avx2(_mm256_add_ps(_mm256_add_ps(s[0], s[1]), s[2])), finite, _CMP_LE_OQ));
+}
+
+/* gsdi_locate for samples at -> at + 7, not of a forest: finds their cells, returns the indices of their bins; outside:
+   which positions are clamped. */
+GSDI_AVX2_INLINE __m256i gsdi_locate_avx2(gsdi_accumulation *a, const gsd_training_sample *samples, uint32_t at,
+                                          const __m256 position[3], __m256 *outside)
+{
+    const gsd_view *view = &a->view;
+    const gsd_desc *desc = &a->field->desc;
+    uint32_t grid[3][8], level[8], i, axis;
+    __m256i g[3], bin = _mm256_setzero_si256();
+    *outside = _mm256_setzero_ps();
+    for (axis = 0; axis < 3; ++axis) {
+        __m256 p = position[axis], t;
+        *outside = _mm256_or_ps(*outside, _mm256_cmp_ps(p, _mm256_set1_ps(desc->bounds_min[axis]), _CMP_LT_OQ));
+        *outside = _mm256_or_ps(*outside, _mm256_cmp_ps(p, _mm256_set1_ps(desc->bounds_max[axis]), _CMP_GT_OQ));
+        t = _mm256_mul_ps(_mm256_sub_ps(p, _mm256_set1_ps(view->origin[axis])), _mm256_set1_ps(view->scale));
+        t = _mm256_min_ps(_mm256_max_ps(t, _mm256_setzero_ps()), _mm256_set1_ps(16777215.0f));
+        g[axis] = _mm256_cvttps_epi32(t);
+        _mm256_storeu_si256((__m256i *)(void *)grid[axis], g[axis]);
+    }
+    for (i = 0; i < 8; ++i) {
+        uint32_t one[3], cell;
+        for (axis = 0; axis < 3; ++axis)
+            one[axis] = grid[axis][i];
+        cell = gsd_cell_at(view, one);
+        level[i] = view->cells[cell].level;
+        a->read_cell[at + i] = cell;
+        a->target_cell[at + i] = gsdi_target(a, &samples[i], cell, one);
+        GSDI_PREFETCH(&a->field->states[a->target_cell[at + i]].pivot);
+    }
+    for (axis = 0; axis < 3; ++axis) {
+        __m256i l = _mm256_loadu_si256((const __m256i *)(const void *)level), shift, third = _mm256_set1_epi32(43691);
+        l = _mm256_add_epi32(l, _mm256_set1_epi32(2 - (int)axis));
+        shift = _mm256_srli_epi32(_mm256_mullo_epi32(l, third), 17); /* l / 3, up to l = 98303 */
+        shift = _mm256_srlv_epi32(g[axis], _mm256_sub_epi32(_mm256_set1_epi32(22), shift));
+        bin = _mm256_or_si256(_mm256_slli_epi32(bin, 2), _mm256_and_si256(shift, _mm256_set1_epi32(3)));
+    }
+    return bin;
+}
+
+/* Eight columns as the first eight words of items. */
+GSDI_AVX2_INLINE void gsdi_items_avx2(const __m256 c[8], gsdi_item *items)
+{
+    uint32_t i;
+    for (i = 0; i < 4; ++i) { /* rows i and i + 4 */
+        __m256 half[2];
+        uint32_t k;
+        for (k = 0; k < 2; ++k) {
+            const __m256 *from = c + 4 * k;
+            __m256 low = i < 2 ? _mm256_unpacklo_ps(from[0], from[1]) : _mm256_unpackhi_ps(from[0], from[1]);
+            __m256 high = i < 2 ? _mm256_unpacklo_ps(from[2], from[3]) : _mm256_unpackhi_ps(from[2], from[3]);
+            half[k] = i & 1 ? _mm256_shuffle_ps(low, high, 0xee) : _mm256_shuffle_ps(low, high, 0x44);
+        }
+        _mm256_storeu_ps((float *)(void *)&items[i], _mm256_permute2f128_ps(half[0], half[1], 0x20));
+        _mm256_storeu_ps((float *)(void *)&items[i + 4], _mm256_permute2f128_ps(half[0], half[1], 0x31));
+    }
+}
+
+/* gsdi_read for samples i .. i + 7, not of a forest. */
+GSDI_AVX2 static void gsdi_read_avx2(gsdi_accumulation *a, gsdi_segment *segment, uint32_t i)
+{
+    const gsd_training_sample *samples = segment->samples + i;
+    uint32_t at = segment->base + i, k, wrong;
+    const void *row[3][8];
+    float nearness[8];
+    __m256 s[12], c[8], valid, outside, rejected, zero = _mm256_setzero_ps(), lit;
+    __m256i bin, wide = _mm256_set1_epi32(0xffffff);
+    for (k = 0; k < 8; ++k) {
+        row[0][k] = samples[k].position;
+        row[1][k] = &samples[k].direction[1];
+        row[2][k] = &samples[k].pixel_contribution;
+    }
+    for (k = 0; k < 3; ++k)
+        gsdi_columns_avx2(row[k], s + 4 * k);
+    valid = gsdi_valid_avx2(s);
+    bin = gsdi_locate_avx2(a, samples, at, s, &outside);
+    rejected = _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_castps_si256(s[6]), _mm256_set1_epi32((int)0x80000000u)));
+    lit = _mm256_and_ps(_mm256_cmp_ps(s[6], zero, _CMP_GT_OQ), _mm256_cmp_ps(s[7], zero, _CMP_GT_OQ));
+    _mm256_storeu_ps(nearness, _mm256_min_ps(s[5], _mm256_set1_ps(a->nearest)));
+    c[0] = _mm256_castsi256_ps(
+        _mm256_or_si256(_mm256_and_si256(_mm256_castps_si256(s[3]), wide), _mm256_slli_epi32(bin, 24)));
+    c[1] = _mm256_castsi256_ps(_mm256_and_si256(_mm256_castps_si256(s[4]), wide));
+    c[2] = _mm256_andnot_ps(rejected, s[a->target == GSD_TARGET_RADIANCE ? 6 : a->target == GSD_TARGET_SIMPLE ? 7 : 8]);
+    c[3] = _mm256_andnot_ps(rejected, s[7]);
+    c[4] = s[9];
+    c[5] = s[10];
+    c[6] = s[11];
+    c[7] = _mm256_andnot_ps(rejected, s[8]);
+    gsdi_items_avx2(c, a->items + at);
+    for (k = 0; k < 8; ++k)
+        a->items[at + k].nearness = nearness[k];
+    wrong = 255u ^ (uint32_t)_mm256_movemask_ps(valid);
+    segment->refused += (uint32_t)__builtin_popcount(wrong);
+    segment->clamped += (uint32_t)__builtin_popcount((uint32_t)_mm256_movemask_ps(_mm256_and_ps(outside, valid)));
+    segment->rejected += (uint32_t)__builtin_popcount((uint32_t)_mm256_movemask_ps(_mm256_and_ps(rejected, valid)));
+    segment->zeros += (uint32_t)__builtin_popcount((uint32_t)_mm256_movemask_ps(_mm256_andnot_ps(lit, valid)));
+    for (k = 0; wrong >> k; ++k)
+        if (wrong >> k & 1)
+            a->read_cell[at + k] = a->target_cell[at + k] = GSDI_NONE;
+}
+#endif
 
 /* Check samples, find their cells and leaf coordinates. */
 static void gsdi_prepare(void *context, uint32_t begin, uint32_t end)
@@ -2732,43 +3184,15 @@ static void gsdi_prepare(void *context, uint32_t begin, uint32_t end)
     uint32_t k, i;
     for (k = begin; k < end; ++k) {
         gsdi_segment *segment = &a->segments[k];
-        for (i = 0; i < segment->count; ++i) {
-            const gsd_training_sample *s = &segment->samples[i];
-            uint32_t at = segment->base + i;
-            gsdi_item *item = &a->items[at];
-            bool rejected = s->radiance == 0 && signbit(s->radiance);
-            if (!gsdi_sample_valid(s)) {
-                segment->refused++;
-                a->read_cell[at] = a->target_cell[at] = GSDI_NONE;
-                continue;
-            }
-            item->x = s->direction[0] & 0xffffffu;
-            item->y = s->direction[1] & 0xffffffu;
-            item->nearness = s->nearness < a->nearest ? s->nearness : a->nearest;
-            if (!gsdi_locate(a, s, at, item, segment)) {
-                segment->refused++;
-                a->read_cell[at] = a->target_cell[at] = GSDI_NONE;
-                continue;
-            }
-            item->value = a->target == GSD_TARGET_RADIANCE ? s->radiance
-                          : a->target == GSD_TARGET_SIMPLE ? s->contribution
-                                                           : s->pixel_contribution;
-            item->value = rejected ? 0 : item->value;
-            item->contribution = rejected ? 0 : s->contribution;
-            item->pixel = rejected ? 0 : s->pixel_contribution;
-            item->pdf_mix = s->pdf_mix;
-            item->pdf_bsdf = s->pdf_bsdf;
-            item->pdf_guide = s->pdf_guide;
-            GSDI_PREFETCH(&a->field->states[a->target_cell[at]].pivot);
-            segment->rejected += rejected;
-            segment->zeros += !(s->radiance > 0) || !(s->contribution > 0);
-        }
-        for (i = 0; i < segment->count; ++i) { /* apart, so that memory has had time */
-            uint32_t at = segment->base + i;
-            gsdi_item *item = &a->items[at];
-            if (a->read_cell[at] != GSDI_NONE && (item->contribution > 0 || item->value > 0))
-                gsdi_see(a, &segment->samples[i], at, item);
-        }
+        i = 0;
+#if GSDI_X86
+        if (a->view.simd >= GSD_SIMD_AVX2 && !a->field->desc.forest_cells)
+            for (; i + 8 <= segment->count; i += 8)
+                gsdi_read_avx2(a, segment, i);
+#endif
+        for (; i < segment->count; ++i)
+            gsdi_read(a, segment, i);
+        gsdi_see_segment(a, segment); /* apart, so that memory has had time */
     }
 }
 
@@ -4791,20 +5215,14 @@ static float *gsdi_row_out(float *base, size_t stride, uint32_t row)
 }
 
 #if GSDI_X86
-#define GSDI_AVX2 __attribute__((target("avx2")))
-
-/* A row of eight bins: gsd_bin_cosine times mass, in the same operations. */
+/* A row of eight bins: gsd_bin_cosine times mass; normal[3]: lift. */
 GSDI_AVX2 static __m256 gsdi_bin_row_avx2(const gsd_view *view, const __m256 normal[4], const float *mass, uint32_t k)
 {
-    __m256 h = _mm256_set1_ps(GSD_HORIZON), zero = _mm256_setzero_ps(), t, r, above;
-    t = _mm256_add_ps(_mm256_mul_ps(normal[0], _mm256_loadu_ps(view->bins + k)),
-                      _mm256_mul_ps(normal[1], _mm256_loadu_ps(view->bins + GSDI_BINS + k)));
-    t = _mm256_add_ps(t, _mm256_mul_ps(normal[2], _mm256_loadu_ps(view->bins + 2 * GSDI_BINS + k)));
-    t = _mm256_sub_ps(t, normal[3]);
-    r = _mm256_min_ps(_mm256_max_ps(_mm256_add_ps(t, h), zero), _mm256_set1_ps(2 * GSD_HORIZON));
-    above = _mm256_add_ps(_mm256_max_ps(_mm256_sub_ps(t, h), zero), _mm256_set1_ps(GSD_BELOW));
-    r = _mm256_add_ps(_mm256_mul_ps(_mm256_mul_ps(r, r), _mm256_set1_ps(0.25f / GSD_HORIZON)), above);
-    return _mm256_mul_ps(_mm256_loadu_ps(mass + k), r);
+    __m256 mean[3];
+    uint32_t axis;
+    for (axis = 0; axis < 3; ++axis)
+        mean[axis] = _mm256_loadu_ps(view->bins + axis * GSDI_BINS + k);
+    return _mm256_mul_ps(_mm256_loadu_ps(mass + k), gsdi_cosine_avx2(normal, mean, normal[3]));
 }
 
 /* gsd_orient. */
@@ -4895,8 +5313,10 @@ GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t
     }
 }
 
-/* Descend up to 64 trees together, one level of each in turn; node[i] ends at a leaf. */
-static void gsdi_descend(const gsd_view *view, uint32_t n, uint32_t *node, uint32_t (*xy)[2], uint32_t *shift)
+/* Descend up to 64 trees together, one level of each in turn; node[i] ends at a leaf. Where a tree ends is anyone's
+   guess: no branches. */
+static void gsdi_descend(const gsd_view *view, uint32_t n, uint32_t *node, const uint32_t *x, const uint32_t *y,
+                         uint32_t *shift)
 {
     uint32_t lane[GSDI_LANES], active = n, i;
     for (i = 0; i < n; ++i)
@@ -4904,49 +5324,111 @@ static void gsdi_descend(const gsd_view *view, uint32_t n, uint32_t *node, uint3
     while (active) {
         uint32_t left = 0;
         for (i = 0; i < active; ++i) {
-            uint32_t l = lane[i], child = view->nodes[node[l]].inner.child, s;
-            if (!child)
-                continue;
-            s = --shift[l];
-            node[l] = child + ((xy[l][0] >> s) & 1u) + 2 * ((xy[l][1] >> s) & 1u);
+            uint32_t l = lane[i], at = node[l], child = view->nodes[at].inner.child, inner = 0u - (child != 0);
+            uint32_t s = --shift[l], next = child + ((x[l] >> s) & 1u) + 2 * ((y[l] >> s) & 1u);
+            node[l] = at ^ ((at ^ next) & inner);
             GSDI_PREFETCH(&view->nodes[node[l]]);
-            lane[left++] = l;
+            lane[left] = l;
+            left -= inner;
         }
         active = left;
     }
 }
 
+/* Up to 64 densities on their way, as arrays. */
+typedef struct gsdi_looks {
+    uint32_t at[GSDI_LANES]; /* index of the query */
+    uint32_t node[GSDI_LANES], x[GSDI_LANES], y[GSDI_LANES], shift[GSDI_LANES];
+    float scale[GSDI_LANES], pdf[GSDI_LANES], even[GSDI_LANES]; /* of the leaf; without a product */
+} gsdi_looks;
+
+/* Coordinates in the quadtree, of queries from i on: one, or eight. */
+static void gsdi_look(gsdi_looks *k, uint32_t i, const gsd_handle *handles, const float *directions, size_t stride)
+{
+    float seen[3];
+    k->scale[i] = gsd_to_pivot(handles[k->at[i]].offset, gsdi_row(directions, stride, k->at[i]), seen);
+    gsd_coordinates(seen, &k->x[i], &k->y[i]);
+}
+
+#if GSDI_X86
+GSDI_AVX2 static void gsdi_look_avx2(gsdi_looks *k, uint32_t i, const gsd_handle *handles, const float *directions,
+                                     size_t stride)
+{
+    const void *row[8];
+    float in[3][8];
+    __m256 offset[4], d[3], scale = _mm256_set1_ps(1);
+    __m256i x, y;
+    uint32_t l, axis;
+    for (l = 0; l < 8; ++l) {
+        const float *direction = gsdi_row(directions, stride, k->at[i + l]);
+        row[l] = &handles[k->at[i + l]].product; /* and offset */
+        for (axis = 0; axis < 3; ++axis)
+            in[axis][l] = direction[axis];
+    }
+    gsdi_columns_avx2(row, offset);
+    for (axis = 0; axis < 3; ++axis)
+        d[axis] = _mm256_loadu_ps(in[axis]);
+    if (_mm256_movemask_ps(gsdi_apart_avx2(offset + 1)))
+        scale = gsdi_to_pivot_avx2(offset + 1, d, d);
+    gsdi_coordinates_avx2(d, &x, &y);
+    _mm256_storeu_ps(&k->scale[i], scale);
+    _mm256_storeu_si256((__m256i *)(void *)&k->x[i], x);
+    _mm256_storeu_si256((__m256i *)(void *)&k->y[i], y);
+}
+
+/* gsd_oriented without a product, of eight. */
+GSDI_AVX2 static void gsdi_even_avx2(const float *pdf, const float *scale, float uniform, float *out)
+{
+    __m256 even = _mm256_set1_ps(uniform * GSD_INV_4PI), leaf = _mm256_loadu_ps(pdf), s = _mm256_loadu_ps(scale), p;
+    p = _mm256_mul_ps(_mm256_max_ps(_mm256_sub_ps(leaf, even), _mm256_setzero_ps()), s);
+    p = _mm256_blendv_ps(_mm256_add_ps(p, even), leaf, _mm256_cmp_ps(s, _mm256_set1_ps(1), _CMP_EQ_OQ));
+    _mm256_storeu_ps(out, p);
+}
+#endif
+
 GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const gsd_handle *handles,
                            const float *directions, size_t direction_stride, float *pdf)
 {
-    uint32_t start, i;
+    uint32_t start, i, eights = 0;
     for (start = 0; start < count; start += GSDI_LANES) {
         uint32_t n = count - start < GSDI_LANES ? count - start : GSDI_LANES;
-        uint32_t node[GSDI_LANES], xy[GSDI_LANES][2], shift[GSDI_LANES];
-        float scale[GSDI_LANES], seen[3];
+        gsdi_looks k;
+        for (i = 0; i < n; ++i)
+            k.at[i] = gsdi_at(index, start + i);
+#if GSDI_X86
+        eights = view->simd >= GSD_SIMD_AVX2 ? n & ~7u : 0;
+        for (i = 0; i < eights; i += 8)
+            gsdi_look_avx2(&k, i, handles, directions, direction_stride);
+#endif
+        for (i = eights; i < n; ++i)
+            gsdi_look(&k, i, handles, directions, direction_stride);
         for (i = 0; i < n; ++i) {
-            uint32_t at = gsdi_at(index, start + i);
-            const gsd_handle *h = &handles[at];
-            scale[i] = gsd_to_pivot(h->offset, gsdi_row(directions, direction_stride, at), seen);
-            gsd_coordinates(seen, &xy[i][0], &xy[i][1]);
-            shift[i] = h->jump;
-            node[i] = h->jump ? h->jump + (xy[i][1] >> 21) * 8 + (xy[i][0] >> 21) : h->root;
+            const gsd_handle *h = &handles[k.at[i]];
+            k.shift[i] = h->jump;
+            k.node[i] = h->jump ? h->jump + (k.y[i] >> 21) * 8 + (k.x[i] >> 21) : h->root;
             if (h->jump)
-                GSDI_PREFETCH(&view->jumps[node[i]]);
+                GSDI_PREFETCH(&view->jumps[k.node[i]]);
             else
-                GSDI_PREFETCH(&view->nodes[node[i]]);
+                GSDI_PREFETCH(&view->nodes[k.node[i]]);
         }
         for (i = 0; i < n; ++i) {
-            if (shift[i]) {
-                node[i] = view->jumps[node[i]];
-                GSDI_PREFETCH(&view->nodes[node[i]]);
+            if (k.shift[i]) {
+                k.node[i] = view->jumps[k.node[i]];
+                GSDI_PREFETCH(&view->nodes[k.node[i]]);
             }
-            shift[i] = shift[i] ? 21 : 24;
+            k.shift[i] = k.shift[i] ? 21 : 24;
         }
-        gsdi_descend(view, n, node, xy, shift);
+        gsdi_descend(view, n, k.node, k.x, k.y, k.shift);
+        for (i = 0; i < n; ++i)
+            k.pdf[i] = view->nodes[k.node[i]].leaf.pdf;
+#if GSDI_X86
+        for (i = 0; i < eights; i += 8)
+            gsdi_even_avx2(&k.pdf[i], &k.scale[i], view->uniform, &k.even[i]);
+#endif
         for (i = 0; i < n; ++i) {
-            uint32_t at = gsdi_at(index, start + i);
-            pdf[at] = gsd_oriented(view, &handles[at], view->nodes[node[i]].leaf.pdf, xy[i][0], xy[i][1], scale[i]);
+            const gsd_handle *h = &handles[k.at[i]];
+            bool done = i < eights && !(h->product > 0);
+            pdf[k.at[i]] = done ? k.even[i] : gsd_oriented(view, h, k.pdf[i], k.x[i], k.y[i], k.scale[i]);
         }
     }
 }
@@ -5047,6 +5529,7 @@ typedef struct gsdi_draws {
     uint32_t node[GSDI_LANES];
     float out[3][GSDI_LANES], pdf[GSDI_LANES];
     float offset[3][GSDI_LANES], scale[GSDI_LANES]; /* of the handle; of gsd_to_pivot */
+    float even[GSDI_LANES];                         /* density without a product */
     uint32_t edge[GSDI_LANES];                      /* not 0: near the leaf's edge */
     uint32_t deep[GSDI_LANES];                      /* not 0: the leaf lies within one bin */
 } gsdi_draws;
@@ -5082,24 +5565,14 @@ GSDI_AVX2 static void gsdi_extend_avx2(gsdi_draws *d, uint32_t lanes, double e)
     }
 }
 
-/* Eight nodes from lane i on, their four words in columns. */
-__attribute__((always_inline)) GSDI_AVX2 static inline void gsdi_nodes_avx2(const gsd_node *nodes, const uint32_t *node,
-                                                                            __m256 column[4])
+/* Eight nodes, their four words in columns. */
+GSDI_AVX2_INLINE void gsdi_nodes_avx2(const gsd_node *nodes, const uint32_t *node, __m256 column[4])
 {
-    __m256 row[4], t[4];
+    const void *at[8];
     uint32_t i;
-    for (i = 0; i < 4; ++i)
-        row[i] =
-            _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps((const float *)(const void *)&nodes[node[i]])),
-                                 _mm_loadu_ps((const float *)(const void *)&nodes[node[i + 4]]), 1);
-    t[0] = _mm256_unpacklo_ps(row[0], row[1]);
-    t[1] = _mm256_unpackhi_ps(row[0], row[1]);
-    t[2] = _mm256_unpacklo_ps(row[2], row[3]);
-    t[3] = _mm256_unpackhi_ps(row[2], row[3]);
-    column[0] = _mm256_shuffle_ps(t[0], t[2], 0x44);
-    column[1] = _mm256_shuffle_ps(t[0], t[2], 0xee);
-    column[2] = _mm256_shuffle_ps(t[1], t[3], 0x44);
-    column[3] = _mm256_shuffle_ps(t[1], t[3], 0xee);
+    for (i = 0; i < 8; ++i)
+        at[i] = &nodes[node[i]];
+    gsdi_columns_avx2(at, column);
 }
 
 /* Narrow four intervals of one axis by split, where active; returns which took the upper half. */
@@ -5184,14 +5657,13 @@ GSDI_AVX2 static void gsdi_leaves_avx2(const gsd_node *nodes, gsdi_draws *d, uin
     }
 }
 
-/* gsd_direction for eight lanes. */
+/* gsd_direction, then gsd_from_pivot and gsd_to_pivot, for eight lanes. */
 GSDI_AVX2 static void gsdi_directions_avx2(gsdi_draws *d, uint32_t lane)
 {
     __m128 fh[2], zh[2];
     __m128i qh[2];
-    __m256 f, g, s, c, r, z, one = _mm256_set1_ps(1), odd, a;
-    __m256i q;
-    uint32_t half;
+    __m256 w[3], o[3], one = _mm256_set1_ps(1), l;
+    uint32_t half, k;
     for (half = 0; half < 2; ++half) {
         __m256d turn = _mm256_mul_pd(_mm256_loadu_pd(&d->r[0][lane + half * 4]), _mm256_set1_pd(5.9604644775390625e-8));
         qh[half] = _mm256_cvttpd_epi32(_mm256_add_pd(_mm256_mul_pd(turn, _mm256_set1_pd(4)), _mm256_set1_pd(0.5)));
@@ -5201,51 +5673,22 @@ GSDI_AVX2 static void gsdi_directions_avx2(gsdi_draws *d, uint32_t lane)
             _mm256_mul_pd(_mm256_loadu_pd(&d->r[1][lane + half * 4]), _mm256_set1_pd(1.1920928955078125e-7)),
             _mm256_set1_pd(1)));
     }
-    f = _mm256_insertf128_ps(_mm256_castps128_ps256(fh[0]), fh[1], 1);
-    z = _mm256_insertf128_ps(_mm256_castps128_ps256(zh[0]), zh[1], 1);
-    q = _mm256_inserti128_si256(_mm256_castsi128_si256(qh[0]), qh[1], 1);
-    g = _mm256_mul_ps(f, f);
-    s = _mm256_add_ps(_mm256_set1_ps(81.5880703f), _mm256_mul_ps(g, _mm256_set1_ps(-75.2377448f)));
-    s = _mm256_add_ps(_mm256_set1_ps(-41.3416277f), _mm256_mul_ps(g, s));
-    s = _mm256_mul_ps(f, _mm256_add_ps(_mm256_set1_ps(6.28318522f), _mm256_mul_ps(g, s)));
-    c = _mm256_add_ps(_mm256_set1_ps(-85.4436999f), _mm256_mul_ps(g, _mm256_set1_ps(59.2443711f)));
-    c = _mm256_add_ps(_mm256_set1_ps(64.9393261f), _mm256_mul_ps(g, c));
-    c = _mm256_add_ps(_mm256_set1_ps(-19.7392087f), _mm256_mul_ps(g, c));
-    c = _mm256_add_ps(one, _mm256_mul_ps(g, c));
-    z = _mm256_min_ps(_mm256_max_ps(z, _mm256_set1_ps(-1)), one);
-    r = _mm256_sqrt_ps(_mm256_mul_ps(_mm256_sub_ps(one, z), _mm256_add_ps(one, z)));
-    odd = _mm256_castsi256_ps(_mm256_slli_epi32(q, 31));
-    a = _mm256_blendv_ps(c, _mm256_xor_ps(s, _mm256_set1_ps(-0.0f)), odd);
-    s = _mm256_blendv_ps(s, c, odd);
-    r = _mm256_xor_ps(r, _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_srli_epi32(q, 1), 31)));
-    _mm256_storeu_ps(&d->out[0][lane], _mm256_mul_ps(r, a));
-    _mm256_storeu_ps(&d->out[1][lane], _mm256_mul_ps(r, s));
-    _mm256_storeu_ps(&d->out[2][lane], z);
-}
-
-/* gsd_from_pivot, then gsd_to_pivot, for eight lanes. */
-GSDI_AVX2 static void gsdi_see_avx2(gsdi_draws *d, uint32_t lane)
-{
-    __m256 w[3], o[3], one = _mm256_set1_ps(1), l, b, s, t;
-    uint32_t k;
+    gsdi_direction_avx2(_mm256_insertf128_ps(_mm256_castps128_ps256(fh[0]), fh[1], 1),
+                        _mm256_inserti128_si256(_mm256_castsi128_si256(qh[0]), qh[1], 1),
+                        _mm256_insertf128_ps(_mm256_castps128_ps256(zh[0]), zh[1], 1), w);
     for (k = 0; k < 3; ++k) {
         o[k] = _mm256_loadu_ps(&d->offset[k][lane]);
-        w[k] = _mm256_sub_ps(_mm256_loadu_ps(&d->out[k][lane]), o[k]);
+        w[k] = _mm256_sub_ps(w[k], o[k]);
     }
-    l = _mm256_add_ps(_mm256_mul_ps(w[0], w[0]), _mm256_mul_ps(w[1], w[1]));
-    l = _mm256_div_ps(one, _mm256_sqrt_ps(_mm256_add_ps(l, _mm256_mul_ps(w[2], w[2]))));
+    l = _mm256_div_ps(one, _mm256_sqrt_ps(gsdi_dot_avx2(w, w)));
     for (k = 0; k < 3; ++k) {
         w[k] = _mm256_mul_ps(w[k], l);
         _mm256_storeu_ps(&d->out[k][lane], w[k]);
     }
-    b = _mm256_add_ps(_mm256_mul_ps(o[0], w[0]), _mm256_mul_ps(o[1], w[1]));
-    b = _mm256_add_ps(b, _mm256_mul_ps(o[2], w[2]));
-    l = _mm256_add_ps(_mm256_mul_ps(o[0], o[0]), _mm256_mul_ps(o[1], o[1]));
-    l = _mm256_add_ps(l, _mm256_mul_ps(o[2], o[2]));
-    s = _mm256_sqrt_ps(_mm256_add_ps(_mm256_sub_ps(one, l), _mm256_mul_ps(b, b)));
-    t = _mm256_sub_ps(s, b);
-    t = _mm256_div_ps(_mm256_mul_ps(t, t), s);
-    _mm256_storeu_ps(&d->scale[lane], _mm256_blendv_ps(one, t, _mm256_cmp_ps(t, _mm256_set1_ps(8), _CMP_LT_OQ)));
+    l = one;
+    if (_mm256_movemask_ps(gsdi_apart_avx2(o)))
+        l = gsdi_to_pivot_avx2(o, w, w);
+    _mm256_storeu_ps(&d->scale[lane], l);
 }
 
 static bool gsdi_aliased(const gsd_handle *h) { return h->alias_count && !(h->product > 0); }
@@ -5260,6 +5703,7 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
     bool aliased = gsdi_aliased(&handles[at[0]]), done[GSDI_LANES / 8];
     uint32_t lanes = (n + 7) & ~7u, left = aliased ? 0 : lanes, i, k; /* those from n on repeat the first */
     for (i = 0; i < lanes; ++i) {
+        const gsd_handle *h = &handles[at[i < n ? i : 0]];
         const float *v = gsdi_row(u, u_stride, at[i < n ? i : 0]);
         for (k = 0; k < 2; ++k) {
             int32_t b = (int32_t)(v[k] * 16777216.0f);
@@ -5267,11 +5711,12 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
             d.lo[k][i] = 0;
             d.width[k][i] = 1;
         }
-        done[i / 8] = false;
         for (k = 0; k < 3; ++k)
-            d.offset[k][i] = handles[at[i < n ? i : 0]].offset[k];
-        d.node[i] = handles[at[i < n ? i : 0]].root;
-        GSDI_PREFETCH(&view->nodes[d.node[i]]);
+            d.offset[k][i] = h->offset[k];
+        d.node[i] = h->root;
+        done[i / 8] = false;
+        if (!aliased)
+            GSDI_PREFETCH(&view->nodes[d.node[i]]);
     }
     gsdi_extend_avx2(&d, lanes, e);
     for (i = 0; !aliased && i < n; ++i) { /* the steps of gsd_choose_bin and gsd_leave_bin, with a prefetch between */
@@ -5326,7 +5771,7 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
     for (i = 0; i < lanes; i += 8) {
         gsdi_leaves_avx2(view->nodes, &d, i);
         gsdi_directions_avx2(&d, i);
-        gsdi_see_avx2(&d, i);
+        gsdi_even_avx2(&d.pdf[i], &d.scale[i], view->uniform, &d.even[i]);
     }
     for (i = 0; i < n; ++i) {
         const gsd_handle *h = &handles[at[i]];
@@ -5339,6 +5784,8 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
             out[k] = d.out[k][i];
         if (d.edge[i] || (h->product > 0 && !d.deep[i]))
             pdf[at[i]] = gsd_pdf(view, h, out);
+        else if (!(h->product > 0))
+            pdf[at[i]] = d.even[i];
         else
             pdf[at[i]] = gsd_oriented(view, h, d.pdf[i], (uint32_t)d.r[0][i], (uint32_t)d.r[1][i], d.scale[i]);
     }

@@ -534,6 +534,87 @@ static void test_distances(void **state)
     gsd_destroy(f);
 }
 
+/* Anything: near and far, with and without a normal, zero, rejected, outside, bad, straight along an axis. */
+static gsd_training_sample any_sample(const gsd_view *v)
+{
+    static const float strange[] = {NAN, INFINITY, -INFINITY, 3e38f, -1, 1e-30f, 1e20f, 0};
+    float p[3], d[3], n[3], even = (float)(0.25 / PI), distance, L;
+    for (int k = 0; k < 3; ++k)
+        p[k] = rng_next() % 16 ? rndf() : rng_next() % 2 ? 3 * rndf() - 1 : (float)(rng_next() % 5) * 0.25f;
+    random_direction(n);
+    random_direction(d);
+    if (rng_next() % 32 == 0)
+        for (uint32_t k = 0, axis = rng_next() % 3; k < 3; ++k)
+            d[k] = k == axis ? rng_next() % 2 ? 1.0f : -1.0f : 0;
+    L = lamp_radiance(p, d, a_lamp, &distance) * (rng_next() % 8 ? 1 + rndf() : 0);
+    L = rng_next() % 16 ? L : GSD_REJECTED;
+    distance = rng_next() % 8 ? distance : rng_next() % 2 ? INFINITY : rndf() * 1e-3f;
+    gsd_handle h = gsd_find(v, p, n, NULL);
+    float guide = rng_next() % 4 ? gsd_pdf(v, &h, d) : 0, c = L * (0.1f + rndf());
+    gsd_training_sample s = gsd_make_scalar_sample(p, d, rng_next() % 3 ? n : NULL, distance, L, c, c * rndf() * 3,
+                                                   0.5f * (guide + even), even, guide);
+    float *const word[] = {&s.position[0],  &s.position[1],        &s.position[2], &s.nearness, &s.radiance,
+                           &s.contribution, &s.pixel_contribution, &s.pdf_mix,     &s.pdf_bsdf, &s.pdf_guide};
+    if (rng_next() % 16 == 0)
+        *word[rng_next() % 10] = strange[rng_next() % 8];
+    return s;
+}
+
+/* A save of what such samples teach at this level; *size = 0 where the machine does not have it. */
+static void *taught(int kind, int level, size_t *size)
+{
+    gsd_desc d = {.bounds_max = {1, 1, 1}, .simd = (gsd_simd)level, .split_samples = kind & 1 ? 0 : 200};
+    gsd_field *f;
+    gsd_stream *stream;
+    d.target = (gsd_target)(GSD_TARGET_RADIANCE + kind % 4);
+    d.spatial_filter = kind & 4 ? GSD_SPATIAL_STOCHASTIC : GSD_SPATIAL_NEAREST;
+    *size = 0;
+    if (gsd_resolve(&d, &d) != GSD_OK)
+        return NULL;
+    OK(gsd_create(&d, &f));
+    OK(gsd_stream_create(f, &stream));
+    seed((uint64_t)kind + 1);
+    for (int k = 0; k < 5; ++k) {
+        gsd_view v = gsd_get_view(f);
+        for (int i = 0; i < 3001; ++i) {
+            gsd_training_sample s = any_sample(&v);
+            OK(gsd_record(stream, &s, 1));
+        }
+        OK(gsd_accumulate(f, &stream, 1, NULL, NULL));
+        gsd_stream_clear(stream);
+        OK(gsd_refine(f, NULL, NULL, NULL));
+    }
+    OK(gsd_validate(f));
+    gsd_stats stats;
+    gsd_get_stats(f, &stats);
+    assert_true(stats.refused > 100 && stats.clamped > 100 && stats.rejected > 100 && stats.cells > 8);
+    void *data = malloc(gsd_save_bound(f));
+    assert_non_null(data);
+    OK(gsd_save(f, data, gsd_save_bound(f), size));
+    gsd_stream_destroy(stream);
+    gsd_destroy(f);
+    return data;
+}
+
+/* Whatever the level, samples teach the same, to the bit. */
+static void test_learning_is_the_same_at_all_levels(void **state)
+{
+    (void)state;
+    for (int kind = 0; kind < 8; ++kind) {
+        size_t size, other;
+        void *scalar = taught(kind, GSD_SIMD_SCALAR, &size);
+        for (int level = GSD_SIMD_AVX2; level <= GSD_SIMD_NEON; ++level) {
+            void *data = taught(kind, level, &other);
+            if (other > 0) {
+                assert_int_equal(other, size);
+                assert_memory_equal(data, scalar, size);
+            }
+            free(data);
+        }
+        free(scalar);
+    }
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -548,6 +629,7 @@ int main(void)
         cmocka_unit_test(test_nearness_is_there_at_once),
         cmocka_unit_test(test_sums_are_those_of_the_sphere),
         cmocka_unit_test(test_distances),
+        cmocka_unit_test(test_learning_is_the_same_at_all_levels),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
