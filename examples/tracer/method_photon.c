@@ -9,6 +9,7 @@
    A pass's photons are traced after its camera paths, which make voxels valid, also those that the refine before has
    cut. While no voxel guides, only every fourth pass has some. */
 #include "method_options.h"
+#include "photon_net.h"
 
 #define GPH_IMPLEMENTATION
 #include "guide_photon.h"
@@ -24,6 +25,7 @@ typedef struct photon {
     double per_path, paths; /* photon paths per camera path; camera paths of one sample per pixel */
     double flux; /* of a photon of this pass: its power times the pass's paths, so that all paths count alike */
     uint64_t stream_peak;
+    photon_net *net; /* NULL = none */
     tr_parallel_fn parallel;
     void *parallel_user;
 } photon;
@@ -57,6 +59,21 @@ static bool parse(parser *p, gph_desc *d, photon *m)
     return p->ok;
 }
 
+/* net=on|off|FILE. */
+static bool parse_net(parser *p, const gph_desc *d, photon *m)
+{
+    const char *value = option(p->env, "net");
+    double share = number(p, "net_share", 0.1);
+    if (!p->ok || !value || !strcmp(value, "off"))
+        return p->ok;
+    if (d->rows != 0 && d->rows != PN_ROWS) {
+        complain(p, "net", value, "rows=32 with it");
+        return false;
+    }
+    m->net = photon_net_create(strcmp(value, "on") ? value : NULL, share, p->err, p->err_size);
+    return m->net != NULL;
+}
+
 /* ---- life */
 
 static void photon_destroy(void *method)
@@ -67,6 +84,7 @@ static void photon_destroy(void *method)
     for (int i = 0; m->streams && i < m->tiles + m->photon_tiles; ++i)
         gph_stream_destroy(m->streams[i]);
     free(m->streams);
+    photon_net_destroy(m->net);
     gph_destroy(m->field);
     free(m);
 }
@@ -88,7 +106,7 @@ static void *photon_create(tr_method_env *env, char *err, size_t err_size)
     m->parallel = env->parallel;
     m->parallel_user = env->parallel_user;
     m->paths = (double)env->width * env->height;
-    if (!parse(&p, &desc, m)) {
+    if (!parse(&p, &desc, m) || !parse_net(&p, &desc, m)) {
         photon_destroy(m);
         return NULL;
     }
@@ -192,8 +210,9 @@ static bool photon_end_pass(void *method, const tr_pass *pass)
         return true;
     photon_flush(m);
     gph_result result = gph_refine(m->field, m->parallel, m->parallel_user);
+    bool ok = !result && (!m->net || photon_net_refine(m->net, m->field, m->parallel, m->parallel_user));
     m->view = gph_get_view(m->field);
-    return !result;
+    return ok;
 }
 
 /* ---- queries */
@@ -263,6 +282,10 @@ static void photon_stats(void *method, tr_method_stats *stats)
              (unsigned long long)s.recycled, (unsigned long long)s.built, (unsigned long long)s.skipped, s.open_voxels,
              s.closed_voxels, s.unjudged_voxels, (unsigned long long)s.opened, (unsigned long long)s.closed,
              (unsigned long long)s.probed, (double)s.closed_share, (double)s.mean_alpha, (double)s.useful_share);
+    if (m->net) {
+        size_t n = strlen(stats->json);
+        photon_net_stats(m->net, stats->json + n, sizeof stats->json - n);
+    }
 }
 
 const tr_method tr_method_photon = {.name = "photon",
