@@ -10,6 +10,7 @@
 #   make study-kd-readme [PRESET=quick]   put its tables and pictures into the README
 #   make stress      hostile and extreme input for every header, STRESS_SECONDS=30 STRESS_SEED=1 STRESS_ONLY=group
 #                    STRESS_CASES=50: so many cases a group instead, the same on every machine
+#   make build/train_histogram            data and training of the network in examples/weights (--help)
 #   make format      clang-format in place  make lint        only check
 #
 #   config=release|debug|scalar|sanitize|tsan|coverage    each has its own folder (build/, build-debug/, ...)

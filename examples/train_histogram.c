@@ -26,7 +26,7 @@
 enum { MAX_DATA = 8 };
 
 typedef struct options {
-    const char *data[MAX_DATA], *checkpoint, *weights, *curve;
+    const char *data[MAX_DATA], *scene, *checkpoint, *weights, *curve;
     int data_count;
     double rooms, room_seconds, seconds, steps, seed, threads, batch, rate, lambda, deep;
     uint32_t channels[GNN_MAX_LEVELS];
@@ -321,8 +321,8 @@ typedef struct room {
     tr_scene *scene;
     tr_rng rng;
     bool nee;
-    vec3 size;
-    int turn; /* which axis of the world is the histograms' z */
+    vec3 size; /* 0 = not known: a scene from a file */
+    int turn;  /* which axis of the world is the histograms' z */
     gph_field *fields[FIELDS];
     gph_stream *stream;
     double flux;
@@ -337,6 +337,8 @@ typedef struct room {
 static bool within_room(const room *m, vec3 p)
 {
     const float e = 0.02f;
+    if (m->size.x == 0)
+        return true;
     return p.x > -e && p.y > -e && p.z > -e && p.x < m->size.x + e && p.y < m->size.y + e && p.z < m->size.z + e;
 }
 
@@ -354,7 +356,7 @@ static void make_fields(room *m)
     memset(&d, 0, sizeof d);
     memcpy(d.bounds_min, &m->scene->bounds_min, sizeof d.bounds_min);
     memcpy(d.bounds_max, &m->scene->bounds_max, sizeof d.bounds_max);
-    d.grid_cells = 5 + (uint32_t)(rng_float(&m->rng) * 8);
+    d.grid_cells = m->size.x > 0 ? 5 + (uint32_t)(rng_float(&m->rng) * 8) : 0; /* the default */
     m->field_count = m->set->planes == HELD_PLANES ? FIELDS : 1;
     for (int k = 0; k < m->field_count; ++k) {
         d.repair = repairs[k];
@@ -519,6 +521,17 @@ static void free_room(room *m)
     free(m);
 }
 
+/* A random room, or with `path` a scene from a file, as the renderer would treat it. */
+static void open_scene(room *m, const char *path)
+{
+    tr_log log = {.out = stderr};
+    m->nee = path || !chance(&m->rng, 0.25f);
+    m->turn = path ? 0 : (int)(rng_float(&m->rng) * 3);
+    m->scene = path ? tr_scene_load(path, NULL, 0, 1, &log) : make_room(&m->rng, &m->size);
+    if (!m->scene)
+        die(path, "cannot be loaded");
+}
+
 /* Passes as the renderer makes them, each a quarter of all before or as many as all before, or all alike. */
 static void run_room(const options *o, int number, set *to)
 {
@@ -529,13 +542,16 @@ static void run_room(const options *o, int number, set *to)
     m->rng = rng_seed(seed, 0);
     m->set = to;
     m->first = to->count;
-    m->nee = !chance(&m->rng, 0.25f);
-    m->turn = (int)(rng_float(&m->rng) * 3);
-    m->scene = make_room(&m->rng, &m->size);
+    open_scene(m, o->scene);
     make_fields(m);
     uint32_t first = (uint32_t)log_within(&m->rng, 1500, 30000), paths = first;
     float growth = growths[(int)(rng_float(&m->rng) * 3)];
-    int passes = 1 + (int)(rng_float(&m->rng) * 12), stride = passes > MAX_SNAPSHOTS ? 2 : 1;
+    int passes = 1 + (int)(rng_float(&m->rng) * 12), stride = passes > MAX_SNAPSHOTS || o->scene ? 2 : 1;
+    if (o->scene) {
+        first = paths = 14400; /* a path a pixel */
+        growth = 0.25f;
+        passes = 12;
+    }
     for (int t = 0; t < passes && all < 400000; ++t) {
         hits += shoot(m, seed * 2 + 1, t, paths, record);
         learn(m);
@@ -662,8 +678,8 @@ static void scale_truths(set *s)
 
 static void make_data(const options *o, set sets[2])
 {
-    for (int k = 0; k < (int)o->rooms; ++k) {
-        run_room(o, k, &sets[k % 6 == 5]);
+    for (int k = 0; k < (o->scene ? 1 : (int)o->rooms); ++k) {
+        run_room(o, k, &sets[o->scene || k % 6 == 5]);
         scale_truths(&sets[0]);
         scale_truths(&sets[1]);
         if (o->data_count && (k % 10 == 9 || k + 1 == (int)o->rooms))
@@ -969,6 +985,7 @@ static const char usage[] =
     "usage: train_histogram [options]\n"
     "  --data FILE          data set: read where the file is there, else made and written; repeatable to read several\n"
     "  --rooms N            rooms to make (60), every sixth held out   --room-seconds S  CPU seconds for each (5)\n"
+    "  --scene FILE         no rooms and no training: judge on the maps of this scene\n"
     "  --seconds S          CPU seconds of training (0 = none), or     --steps N  as many steps\n"
     "  --checkpoint FILE    written while training; where it is there, training goes on from it "
     "(histogram.checkpoint)\n"
@@ -1003,6 +1020,8 @@ static bool set_option(options *o, const char *key, const char *value)
         }
     if (!strcmp(key, "--data") && o->data_count < MAX_DATA)
         o->data[o->data_count++] = value;
+    else if (!strcmp(key, "--scene"))
+        o->scene = value;
     else if (!strcmp(key, "--checkpoint"))
         o->checkpoint = value;
     else if (!strcmp(key, "--weights"))
@@ -1045,6 +1064,10 @@ int main(int argc, char **argv)
     set sets[2] = {{.planes = TRAIN_PLANES}, {.planes = HELD_PLANES}};
     state s = {0, 0, 0};
     runner r;
+    if (argc == 2 && !strcmp(argv[1], "--help")) {
+        fputs(usage, stdout);
+        return 0;
+    }
     for (int i = 1; i < argc; i += 2)
         if (i + 1 == argc || !set_option(&o, argv[i], argv[i + 1])) {
             fprintf(stderr, "train_histogram: %s: unknown, or without a value that it can have\n%s", argv[i], usage);
@@ -1058,11 +1081,12 @@ int main(int argc, char **argv)
     if (!there)
         make_data(&o, sets);
     printf("%u maps to train, %u held out\n", sets[0].count, sets[1].count);
-    if (!sets[0].count || !sets[1].count)
+    if ((!sets[0].count && !o.scene) || !sets[1].count)
         die("data", "too few rooms had enough light: make more by --rooms or --room-seconds");
     start_runner(&r, make_net(&o), (uint32_t)o.batch, (int)o.threads);
     load_net(r.net, o.checkpoint, &s);
-    train(&o, &r, sets, &s);
+    if (sets[0].count)
+        train(&o, &r, sets, &s);
     report(&r, &sets[1], s.step > 0);
     if (o.weights && s.step > 0)
         save_net(r.net, GNN_TYPE_F16, o.weights, &s);

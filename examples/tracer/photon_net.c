@@ -167,7 +167,7 @@ void photon_net_destroy(photon_net *n)
 
 /* Work in microseconds of one core (AVX2, scenes spot and egg): of a recorded vertex all that a camera path spends on
    it, of a photon its path, of a map gph_refine's repair; of the network's map with its way in and out. */
-static const double vertex_work = 0.7, photon_work = 0.4, map_work = 90, net_work = 170;
+static const double vertex_work = 0.7, photon_work = 0.4, map_work = 90, net_work = 230;
 
 /* How many more maps the share pays for. */
 static uint32_t maps_to_afford(const photon_net *n, const gph_field *field)
