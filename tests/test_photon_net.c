@@ -6,6 +6,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #include "photon_net.h"
 #include "rng.h"
@@ -18,7 +19,7 @@ static const float at[3] = {0.5f, 0.5f, 0.5f};
 static photon_net *make_net(double share)
 {
     char err[512] = "";
-    photon_net *net = photon_net_create(NULL, share, err, sizeof err);
+    photon_net *net = photon_net_create(NULL, share, 0, err, sizeof err);
     if (!net)
         fail_msg("%s", err);
     return net;
@@ -222,7 +223,7 @@ static void refuse(const char *path, const void *data, size_t size, const char *
         assert_int_equal(fwrite(data, 1, size, f), size);
         fclose(f);
     }
-    assert_null(photon_net_create(path, 0.1, err, sizeof err));
+    assert_null(photon_net_create(path, 0.1, 0, err, sizeof err));
     if (data)
         remove(path);
     print_message("%s\n", err);
@@ -237,7 +238,7 @@ static void broken_weights_are_refused_with_file_and_remedy(void **state)
     unsigned char *data = read_weights(&size);
     char path[64];
     (void)state;
-    snprintf(path, sizeof path, "photon-net-%lu.tmp", (unsigned long)rng_next() % 1000000);
+    snprintf(path, sizeof path, "photon-net-%ld.tmp", (long)getpid());
     refuse("no/such/file", NULL, 0, "cannot read");
     refuse(path, data, size / 2, "lie outside the file");
     refuse(path, data, 0, "cannot read");

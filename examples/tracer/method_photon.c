@@ -70,7 +70,7 @@ static bool parse_net(parser *p, const gph_desc *d, photon *m)
         complain(p, "net", value, "rows=32 with it");
         return false;
     }
-    m->net = photon_net_create(strcmp(value, "on") ? value : NULL, share, p->err, p->err_size);
+    m->net = photon_net_create(strcmp(value, "on") ? value : NULL, share, m->tiles, p->err, p->err_size);
     return m->net != NULL;
 }
 
@@ -158,6 +158,8 @@ static bool photon_record(void *method, int tile, const tr_vertex *vertices, int
     photon *m = method;
     gph_vertex samples[64];
     bool ok = true;
+    if (m->net)
+        photon_net_see(m->net, tile, vertices, n);
     for (int done = 0; done < n;) {
         int k = 0;
         for (; k < 64 && done < n; ++k, ++done)

@@ -2,6 +2,7 @@
 
      >>maps     inputs and answers of one map
      >>weights  the file
+     >>visits   which voxels camera paths meet
      >>refine   which maps, and how many */
 #include "photon_net.h"
 
@@ -90,11 +91,19 @@ void pn_repaired(const gph_handle *handle, float *map)
 /* Maps that are worked on at once: so many at a time, each range of GRAIN with a workspace of its own. */
 enum { BATCH = 128, GRAIN = 8 };
 
+/* Every SEEN-th vertex of a tile's camera paths since the last refine. */
+enum { SEEN = 32 };
+typedef struct seen {
+    float (*at)[3];
+    uint32_t count, capacity, passed;
+} seen;
+
 struct photon_net {
     gnn_unet *unet;
+    seen *tiles;
+    int tile_count;
     double share;
-    uint64_t begun, done, passes, over_budget; /* maps that changed, that the network made; passes that it was asked */
-    uint32_t turn;                             /* where the next pass begins among the voxels that changed */
+    uint64_t changed, done, over_budget; /* maps that changed, those that the network made, that it did not */
     /* of the call */
     const gph_field *field;
     gph_view view;
@@ -136,15 +145,19 @@ static bool load_weights(photon_net *n, const char *path, char *err, size_t err_
     return !result;
 }
 
-photon_net *photon_net_create(const char *path, double share, char *err, size_t err_size)
+photon_net *photon_net_create(const char *path, double share, int tiles, char *err, size_t err_size)
 {
     photon_net *n = calloc(1, sizeof *n);
     gnn_unet_desc desc = pn_desc();
-    if (!n || gnn_unet_create(&desc, &n->unet)) {
+    seen *all = calloc(tiles > 0 ? (size_t)tiles : 1, sizeof *all);
+    if (!n || !all || gnn_unet_create(&desc, &n->unet)) {
         snprintf(err, err_size, "photon: out of memory for the network");
+        free(all);
         free(n);
         return NULL;
     }
+    n->tiles = all;
+    n->tile_count = tiles;
     n->share = share;
     if (!load_weights(n, path ? path : TR_WEIGHTS "/histogram.safetensors", err, err_size)) {
         photon_net_destroy(n);
@@ -158,9 +171,70 @@ void photon_net_destroy(photon_net *n)
     if (!n)
         return;
     gnn_unet_destroy(n->unet);
+    for (int i = 0; i < n->tile_count; ++i)
+        free(n->tiles[i].at);
+    free(n->tiles);
     free(n->workspaces);
     free(n->inputs);
     free(n);
+}
+
+/* ---- >>visits ----------------------------------------------------------------------------------------------- */
+
+void photon_net_see(photon_net *n, int tile, const tr_vertex *vertices, int count)
+{
+    seen *s = &n->tiles[tile];
+    for (int i = 0; i < count; ++i) {
+        if (s->passed++ % SEEN)
+            continue;
+        if (s->count == s->capacity) {
+            uint32_t capacity = s->capacity ? 2 * s->capacity : 256;
+            void *grown = realloc(s->at, capacity * sizeof *s->at);
+            if (!grown)
+                return; /* it is but a sample */
+            s->at = grown;
+            s->capacity = capacity;
+        }
+        memcpy(s->at[s->count++], &vertices[i].p, sizeof *s->at);
+    }
+}
+
+typedef struct visited {
+    uint32_t times, voxel;
+} visited;
+
+static int by_times(const void *a, const void *b)
+{
+    const visited *x = a, *y = b;
+    if (x->times != y->times)
+        return x->times > y->times ? -1 : 1;
+    return x->voxel < y->voxel ? -1 : x->voxel > y->voxel;
+}
+
+/* False = out of memory. */
+static bool most_visited_first(photon_net *n, uint32_t *voxels, uint32_t count)
+{
+    uint32_t *times = calloc((size_t)n->view.voxel_count + 1, sizeof *times);
+    visited *list = malloc((count + 1) * sizeof *list);
+    for (int t = 0; times && t < n->tile_count; ++t) {
+        for (uint32_t i = 0; i < n->tiles[t].count; ++i) {
+            uint32_t voxel = gph_find_voxel(&n->view, n->tiles[t].at[i]);
+            times[voxel == GPH_NONE ? n->view.voxel_count : voxel]++;
+        }
+        n->tiles[t].count = 0;
+    }
+    bool ok = times && list;
+    for (uint32_t i = 0; ok && i < count; ++i) {
+        list[i].times = times[voxels[i]];
+        list[i].voxel = voxels[i];
+    }
+    if (ok)
+        qsort(list, count, sizeof *list, by_times);
+    for (uint32_t i = 0; ok && i < count; ++i)
+        voxels[i] = list[i].voxel;
+    free(times);
+    free(list);
+    return ok;
 }
 
 /* ---- >>refine ----------------------------------------------------------------------------------------------- */
@@ -213,55 +287,37 @@ static bool need_memory(photon_net *n)
     return true;
 }
 
-/* voxels[0 .. count - 1], from `turn` on, as many as there are means for. */
-static void choose_turn(photon_net *n, uint32_t *voxels, uint32_t count, uint32_t afford)
-{
-    uint32_t first = 0;
-    while (first < count && voxels[first] < n->turn)
-        ++first;
-    for (int part = 0; part < 3; ++part) { /* rotate by three reversals */
-        uint32_t low = part == 1 ? first : 0, high = part == 0 ? first : count;
-        for (; low + 1 < high; ++low, --high) {
-            uint32_t v = voxels[low];
-            voxels[low] = voxels[high - 1];
-            voxels[high - 1] = v;
-        }
-    }
-    n->turn = afford < count ? voxels[afford] : 0;
-}
-
 bool photon_net_refine(photon_net *n, gph_field *field, tr_parallel_fn parallel, void *parallel_user)
 {
     uint32_t count = gph_changed_voxels(field, NULL, 0), afford = maps_to_afford(n, field);
     uint32_t *voxels = malloc((count + 1) * sizeof *voxels);
+    n->field = field;
+    n->view = gph_get_view(field);
+    afford = afford < count ? afford : count;
     if (!voxels || !need_memory(n)) {
         free(voxels);
         return false;
     }
     gph_changed_voxels(field, voxels, count);
-    afford = afford < count ? afford : count;
-    if (afford < count)
-        choose_turn(n, voxels, count, afford);
-    n->passes++;
-    n->begun += count;
+    bool ok = most_visited_first(n, voxels, count);
+    n->changed += count;
     n->over_budget += count - afford;
-    n->field = field;
-    n->view = gph_get_view(field);
-    for (uint32_t begin = 0, k; begin < afford; begin += k) {
+    for (uint32_t begin = 0, k; ok && begin < afford; begin += k) {
         k = afford - begin < BATCH ? afford - begin : BATCH;
         n->voxels = voxels + begin;
         if (parallel)
             parallel(parallel_user, k, GRAIN, refine_range, n);
         else
             refine_range(n, 0, k);
-        n->done += gph_import_maps(field, n->voxels, k, n->maps, parallel, parallel_user);
+        gph_import_maps(field, n->voxels, k, n->maps, parallel, parallel_user);
+        n->done += k;
     }
     free(voxels);
-    return true;
+    return ok;
 }
 
 void photon_net_stats(const photon_net *n, char *text, size_t size)
 {
     snprintf(text, size, ", \"net_changed\": %llu, \"net_maps\": %llu, \"net_over_budget\": %llu",
-             (unsigned long long)n->begun, (unsigned long long)n->done, (unsigned long long)n->over_budget);
+             (unsigned long long)n->changed, (unsigned long long)n->done, (unsigned long long)n->over_budget);
 }

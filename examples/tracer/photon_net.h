@@ -33,11 +33,14 @@ void pn_repaired(const gph_handle *handle, float *map);
 typedef struct photon_net photon_net;
 
 /* Read the weights; path NULL = those that come with the renderer. share: of the CPU time spent so far that the network
-   may take, counted in work, not measured. NULL with a reason in err. */
-photon_net *photon_net_create(const char *path, double share, char *err, size_t err_size);
+   may take, counted in work, not measured. tiles: that photon_net_see is told. NULL with a reason in err. */
+photon_net *photon_net_create(const char *path, double share, int tiles, char *err, size_t err_size);
 void photon_net_destroy(photon_net *net);
-/* After gph_refine: reconstruct the maps that it made anew and camera paths read, as far as the share goes, in turn.
-   False = out of memory; the field is as gph_refine left it then. The result does not depend on threads. */
+/* Vertices of camera paths, to know which voxels they need most. One thread per tile at a time. */
+void photon_net_see(photon_net *net, int tile, const tr_vertex *vertices, int n);
+/* After gph_refine: reconstruct the maps that it made anew and camera paths read, those that they met most often first,
+   as far as the share goes. False = out of memory; the field is as gph_refine left it then. The result does not depend
+   on threads. */
 bool photon_net_refine(photon_net *net, gph_field *field, tr_parallel_fn parallel, void *parallel_user);
 /* More JSON members, each after a comma. */
 void photon_net_stats(const photon_net *net, char *text, size_t size);
