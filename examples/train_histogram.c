@@ -878,7 +878,8 @@ static void draw_curve(const options *o, const char *points)
         ++n;
     if (f)
         fclose(f);
-    plot_series s[2] = {{"training", seconds, train, n, true}, {"held-out rooms", seconds, held, n, false}};
+    plot_series s[2] = {{"training, all levels", seconds, train, n, true},
+                        {"held-out rooms, top level", seconds, held, n, false}};
     if (!plot_write(o->curve, "Loss of the network for histograms", "CPU seconds", "loss", s, 2, false, false))
         die(o->curve, "cannot be written");
 }
