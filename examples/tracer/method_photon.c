@@ -12,6 +12,7 @@
    >>budget. */
 #include "emission.h"
 #include "method_options.h"
+#include "photon_net.h"
 
 #define GPH_IMPLEMENTATION
 #include "guide_photon.h"
@@ -44,6 +45,7 @@ typedef struct photon {
     photon_budget budget;
     double flux; /* of a photon of this pass: its power times the pass's paths, so that all paths count alike */
     uint64_t stream_peak;
+    photon_net *net; /* NULL = none */
     tr_parallel_fn parallel;
     void *parallel_user;
 } photon;
@@ -80,6 +82,21 @@ static bool parse(parser *p, gph_desc *d, photon *m)
     return p->ok;
 }
 
+/* net=on|off|FILE. */
+static bool parse_net(parser *p, const gph_desc *d, photon *m)
+{
+    const char *value = option(p->env, "net");
+    double share = number(p, "net_share", 0.1);
+    if (!p->ok || !value || !strcmp(value, "off"))
+        return p->ok;
+    if (d->rows != 0 && d->rows != PN_ROWS) {
+        complain(p, "net", value, "rows=32 with it");
+        return false;
+    }
+    m->net = photon_net_create(strcmp(value, "on") ? value : NULL, share, m->tiles, p->err, p->err_size);
+    return m->net != NULL;
+}
+
 /* ---- life */
 
 static void photon_destroy(void *method)
@@ -90,6 +107,7 @@ static void photon_destroy(void *method)
     for (int i = 0; m->streams && i < m->tiles + m->photon_tiles; ++i)
         gph_stream_destroy(m->streams[i]);
     free(m->streams);
+    photon_net_destroy(m->net);
     gph_destroy(m->field);
     tr_emission_destroy(m->emission);
     free(m->budget.handed);
@@ -113,7 +131,7 @@ static void *photon_create(tr_method_env *env, char *err, size_t err_size)
     m->parallel = env->parallel;
     m->parallel_user = env->parallel_user;
     m->paths = (double)env->width * env->height;
-    if (!parse(&p, &desc, m)) {
+    if (!parse(&p, &desc, m) || !parse_net(&p, &desc, m)) {
         photon_destroy(m);
         return NULL;
     }
@@ -209,6 +227,8 @@ static bool photon_record(void *method, int tile, const tr_vertex *vertices, int
     photon *m = method;
     gph_vertex samples[64];
     bool ok = true;
+    if (m->net)
+        photon_net_see(m->net, tile, vertices, n);
     for (int done = 0; done < n;) {
         int k = 0;
         for (; k < 64 && done < n; ++k, ++done)
@@ -267,11 +287,12 @@ static bool photon_end_pass(void *method, const tr_pass *pass)
         return true;
     photon_flush(m);
     gph_result result = gph_refine(m->field, m->parallel, m->parallel_user);
+    bool ok = !result && (!m->net || photon_net_refine(m->net, m->field, m->parallel, m->parallel_user));
     m->view = gph_get_view(m->field);
     if (m->emission && m->flux > 0)
         tr_emission_learn(m->emission);
     photon_judge(m, pass);
-    return !result;
+    return ok;
 }
 
 /* ---- queries */
@@ -352,6 +373,10 @@ static void photon_stats(void *method, tr_method_stats *stats)
              (unsigned long long)s.probed, (double)s.closed_share, (double)s.mean_alpha, (double)s.useful_share,
              m->budget.rate, m->budget.yield, m->budget.passes, m->budget.skipped,
              m->emission ? tr_emission_gain(m->emission) : 1);
+    if (m->net) {
+        size_t n = strlen(stats->json);
+        photon_net_stats(m->net, stats->json + n, sizeof stats->json - n);
+    }
 }
 
 const tr_method tr_method_photon = {.name = "photon",
