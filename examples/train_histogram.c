@@ -682,7 +682,7 @@ static void make_data(const options *o, set sets[2])
         run_room(o, k, &sets[o->scene || k % 6 == 5]);
         scale_truths(&sets[0]);
         scale_truths(&sets[1]);
-        if (o->data_count && (k % 10 == 9 || k + 1 == (int)o->rooms))
+        if (o->data_count && (o->scene || k % 10 == 9 || k + 1 == (int)o->rooms))
             save_data(o->data[0], sets);
     }
 }
