@@ -101,7 +101,7 @@ EXAMPLE_TOOLS := $(B)/train_histogram
 EXAMPLES := $(patsubst examples/%.c,$(B)/examples/%,$(filter-out $(EXAMPLE_TOOLS:$(B)/%=examples/%.c),$(wildcard examples/*.c)))
 TESTS_ALL := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/test_*.c))
 # The other tests are of the headers alone.
-TRACER_TESTS := bsdf image light photon_pass render scene
+TRACER_TESTS := bsdf image light photon_net photon_pass render scene
 MICRO := $(B)/bench_sdtree $(B)/bench_kd $(B)/bench_photon $(B)/bench_field $(B)/bench_denoise $(B)/bench_nn
 BENCHES := $(patsubst bench/%.c,$(B)/%,$(wildcard bench/bench_*.c))
 STRESSES := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/stress_*.c))
