@@ -1473,7 +1473,8 @@ static void photons_of_no_use_are_given_up(void **state)
     uint64_t paths[2];
     for (int k = 0; k < 2; ++k) {
         tr_option option = {.key = "budget", .value = k ? "on" : "off"};
-        tr_settings settings = {.width = 32, .height = 32, .spp = 64, .threads = 1, .options = &option};
+        tr_settings settings = {.width = 16, .height = 16, .spp = 64, .threads = 1, .options = &option};
+        settings.max_depth = 5;
         tr_result result;
         char err[256] = "";
         settings.option_count = 1;
