@@ -272,7 +272,7 @@ test: deps
 
 # What the tests of the command line and of the rig run; the fast build has the examples too, for the optimiser's warnings.
 CLI_PROGRAMS := $(if $(if $(TESTS),$(filter cli,$(TESTS)),all),$(PROGRAMS) $(B)/make_reference $(B)/bench_field)
-RIG_PROGRAMS := $(if $(filter release,$(config)),$(if $(if $(TESTS),$(filter rig,$(TESTS)),all),$(PROGRAMS) $(B)/bench_error $(B)/study_kd))
+RIG_PROGRAMS := $(if $(filter release,$(config)),$(if $(if $(TESTS),$(filter rig,$(TESTS)),all),$(PROGRAMS) $(B)/bench_error $(B)/make_reference $(B)/study_kd))
 OPTIMISED := $(if $(filter release,$(config)),$(if $(TESTS),,$(EXAMPLES)))
 
 run-test: $(TEST_PROGRAMS) $(CLI_PROGRAMS) $(RIG_PROGRAMS) $(OPTIMISED)

@@ -79,11 +79,7 @@ static inline const row *find_row(const rows *all, const char *scene, const char
 
 typedef double (*row_value)(const row *r);
 static inline double value_relmse(const row *r) { return r->relmse; }
-/* Without the error that the reference has itself, where that is known and at most half of it. */
-static inline double value_relmse_less(const row *r)
-{
-    return r->reference_relmse <= 0.5 * r->relmse ? r->relmse - r->reference_relmse : (double)NAN;
-}
+static inline double value_reference(const row *r) { return r->reference_relmse; }
 static inline double value_mrae(const row *r) { return r->mrae; }
 static inline double value_spp(const row *r) { return r->spp; }
 static inline double value_seconds(const row *r) { return r->cpu_seconds; }
@@ -124,6 +120,18 @@ static inline estimate ratio_of(const plan *p, const rows *all, const char *scen
             values[n++] = of(ra) / of(rb);
     }
     return geometric(values, n);
+}
+
+/* Of the relMSE of column a over that of column b without the error that the scene's reference has itself. Nothing
+   where that is not known, or more than half of either: decided for all seeds together, single ones would choose
+   themselves. */
+static inline double ratio_less(const plan *p, const rows *all, const char *scene, column a, column b,
+                                const char *budget)
+{
+    double reference = mean_of(p, all, scene, a, budget, value_reference).value;
+    double over = mean_of(p, all, scene, a, budget, value_relmse).value;
+    double under = mean_of(p, all, scene, b, budget, value_relmse).value;
+    return reference <= 0.5 * fmin(over, under) ? (over - reference) / (under - reference) : (double)NAN;
 }
 
 /* Over several scenes; their number is mean.count. */

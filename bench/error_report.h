@@ -202,8 +202,8 @@ static void write_table(FILE *f, const plan *p, const rows *all)
                 print_estimate(f, mean_of(p, all, scene, columns[c], budget, value_denoise), "%.2f %%");
                 print_estimate(f, mean_of(p, all, scene, columns[c], budget, value_relmse), "%.4g");
                 print_ratio(f, ratio_of(p, all, scene, columns[c], columns[0], budget, value_relmse));
-                estimate less = ratio_of(p, all, scene, columns[c], columns[0], budget, value_relmse_less);
-                print_estimate(f, less, "%.3f");
+                double less = ratio_less(p, all, scene, columns[c], columns[0], budget);
+                print_estimate(f, (estimate){less, 0, 0, 1}, "%.3f");
                 print_estimate(f, mean_of(p, all, scene, columns[c], budget, value_mrae), "%.4g");
                 print_estimate(f, ratio_of(p, all, scene, columns[c], columns[0], budget, value_efficiency), "%.2fx");
                 fputc('\n', f);
@@ -217,6 +217,19 @@ static estimate most(const plan *p, const rows *all, column c, const char *budge
     for (int s = 0; s < p->scenes.count; ++s)
         e.value = fmax(e.value, mean_of(p, all, p->scenes.at[s], c, budget, of).value);
     return e;
+}
+
+/* Over the scenes that have a ratio without their reference's error, and how many these are. */
+static void print_less(FILE *f, const plan *p, const rows *all, column a, column b, const char *budget)
+{
+    double ratios[MAX_NAMES];
+    for (int s = 0; s < p->scenes.count; ++s)
+        ratios[s] = ratio_less(p, all, p->scenes.at[s], a, b, budget);
+    estimate e = geometric(ratios, p->scenes.count);
+    if (e.count)
+        fprintf(f, " %.3f, %d scenes |", e.value, e.count);
+    else
+        fputs(" - |", f);
 }
 
 /* What the scenes say together. */
@@ -239,8 +252,7 @@ static void write_overall(FILE *f, const plan *p, const rows *all)
             print_ratio(f, o.mean);
             print_estimate(f, (estimate){o.lowest, 0, 0, 1}, "%.3f");
             print_estimate(f, (estimate){o.highest, 0, 0, 1}, "%.3f");
-            o = overall_ratio(p, all, columns[c], columns[0], budget, value_relmse_less);
-            print_estimate(f, o.mean, "%.3f");
+            print_less(f, p, all, columns[c], columns[0], budget);
             print_ratio(f, overall_ratio(p, all, columns[c], columns[0], budget, value_mrae).mean);
             print_ratio(f, overall_ratio(p, all, columns[c], columns[0], budget, value_seconds).mean);
             print_estimate(f, most(p, all, columns[c], budget, value_denoise), "%.2f %%");

@@ -248,6 +248,20 @@ static void append(text *t, const char *format, ...)
     t->n = t->n < sizeof t->s ? t->n : sizeof t->s - 1;
 }
 
+/* What pictures that may be averaged have in common: the scene's file, without its folder, and what decides the mean.
+ */
+static void picture_text(const options *o, text *t)
+{
+    const char *slash = strrchr(o->scene, '/');
+    append(t, "%s --size %dx%d", slash ? slash + 1 : o->scene, o->width, o->height);
+    if (o->max_depth)
+        append(t, " --max-depth %d", o->max_depth);
+    if (o->no_nee)
+        append(t, " --nee off");
+    for (int i = 0; i < o->define_count; ++i)
+        append(t, " -D %s=%s", o->defines[i].name, o->defines[i].value);
+}
+
 /* Everything besides the scene that decides what a round computes, as options. */
 static void settings_text(const options *o, text *t)
 {
@@ -526,7 +540,7 @@ typedef struct head {
     uint64_t sum;   /* of all that follows, to know a damaged file */
 } head;
 
-static const char state_magic[8] = "trref01";
+static const char state_magic[8] = "trref02";
 
 /* Per method, halves of its rounds (even, odd), of each the sums and sums of squares of the rounds' pixels. */
 typedef struct state {
@@ -668,10 +682,12 @@ static bool made_with(const char *made, uint64_t seed)
 
 static int added_open(added *a, const options *o)
 {
-    char err[512], relmse[128], before[sizeof a->made / 2];
+    char err[512], relmse[128], picture[4096], before[sizeof a->made / 2];
+    text own = {.n = 0};
     *a = (added){0};
     if (!o->add)
         return 0;
+    picture_text(o, &own);
     if (!tr_image_read(o->add, true, &a->image, err, sizeof err))
         return die("%s", err);
     if (a->image.width != o->width || a->image.height != o->height)
@@ -682,6 +698,8 @@ static int added_open(added *a, const options *o)
         sscanf(relmse, "%lf", &a->relmse) != 1 || !(a->relmse > 0))
         return die("%s: does not tell its own error and how it was made; only pictures of make_reference can be added",
                    o->add);
+    if (tr_exr_read_attribute(o->add, "referencePicture", picture, sizeof picture) && strcmp(picture, own.s) != 0)
+        return die("%s: is of '%s', not of '%s'; choose the same settings", o->add, picture, own.s);
     if (tr_exr_read_attribute(o->add, "referenceAdded", before, sizeof before)) {
         size_t n = strlen(a->made);
         snprintf(a->made + n, sizeof a->made - n, " | %s", before);
@@ -793,6 +811,16 @@ static bool judge(const options *o, const state *s, const added *a, quality *q)
     }
     q->reached = s->h.rounds[MAIN] >= MIN_ROUNDS && q->own.relmse * o->ratio <= q->measured;
     return true;
+}
+
+/* Is the added picture one of the same scene? */
+static int check_added(const options *o, const added *a, const quality *q)
+{
+    if (q->apart <= ALIKE * (a->relmse + q->rounds))
+        return 0;
+    return die("%s: not written: %s differs from the rounds by relMSE %.3g, where both errors make %.3g: is it of this "
+               "scene and these settings?",
+               o->out, o->add, q->apart, a->relmse + q->rounds);
 }
 
 /* ---- >>check ------------------------------------------------------------------------------------------------ */
@@ -954,20 +982,10 @@ static int refuse(const options *o, const state *s, const verdict *c)
     return PROGRAM_FAILED;
 }
 
-/* Is the added picture one of the same scene? */
-static int check_added(const options *o, const added *a, const quality *q)
-{
-    if (q->apart <= ALIKE * (a->relmse + q->rounds))
-        return 0;
-    return die("%s: not written: %s differs from the rounds by relMSE %.3g, where both errors make %.3g: is it of this "
-               "scene and these settings?",
-               o->out, o->add, q->apart, a->relmse + q->rounds);
-}
-
 static int write_reference(const options *o, const state *s, const added *a, const quality *q, const verdict *c)
 {
     tr_image mean;
-    text command = {.n = 0};
+    text command = {.n = 0}, picture = {.n = 0};
     char relmse[128], samples[128], check[192], goal[128], taken_in[sizeof a->made + 128], err[512];
     const char *slash = strrchr(o->out, '/');
     append(&command, "make_reference %s ", o->scene);
@@ -987,9 +1005,11 @@ static int write_reference(const options *o, const state *s, const added *a, con
              (long long)s->h.spp[CHECK] * s->h.rounds[CHECK], c->tested, c->left_out, c->worst, c->limit);
     snprintf(taken_in, sizeof taken_in, "own relMSE %.4g, from the rounds by %.4g, weight %.3f: %s", a->relmse,
              q->apart, 1 - q->share, a->made);
-    const tr_attribute attributes[] = {{"referenceCommand", command.s}, {"referenceRelMSE", relmse},
-                                       {"referenceGoal", goal},         {"referenceSamples", samples},
-                                       {"referenceCheck", check},       {"referenceAdded", taken_in}};
+    picture_text(o, &picture);
+    const tr_attribute attributes[] = {{"referencePicture", picture.s}, {"referenceCommand", command.s},
+                                       {"referenceRelMSE", relmse},     {"referenceGoal", goal},
+                                       {"referenceSamples", samples},   {"referenceCheck", check},
+                                       {"referenceAdded", taken_in}};
     int count = (int)(sizeof attributes / sizeof attributes[0]) - (a->relmse > 0 ? 0 : 1);
     if (!mean_image(s, a, q->share, &mean))
         return PROGRAM_FAILED;
@@ -1037,7 +1057,9 @@ static job make_job(const session *w, int method, uint64_t number)
     job j = {.scene = method == CHECK && o->check_scene ? o->check_scene : o->scene, .label = name};
     j.method = tr_method_find(name);
     j.with_set = method == MAIN;
-    j.seed = tr_hash64(o->seed + 4 * number + (uint64_t)method); /* hashed: see rng_seed */
+    /* Hashed twice: rounds of neighbouring --seed share none, so that --add can take them together. See also rng_seed.
+     */
+    j.seed = tr_hash64(tr_hash64(o->seed) + 4 * number + (uint64_t)method);
     return j;
 }
 
@@ -1137,6 +1159,8 @@ static bool run_rounds(session *w, quality *q, verdict *c)
         if (!state_save(s) || !judge(w->o, s, &w->added, q) || !run_check(s, c))
             return false;
         show(w, method, q, c);
+        if (s->h.rounds[MAIN] >= MIN_ROUNDS && check_added(w->o, &w->added, q))
+            return false;
     }
     return true;
 }

@@ -5,7 +5,7 @@
 export LC_ALL=C
 cd "$(dirname "$0")/.." || exit 1
 build=${BUILD:-build}
-rig=$build/bench_error render=$build/render
+rig=$build/bench_error render=$build/render reference=$build/make_reference
 tmp=$(mktemp -d) || exit 1
 trap 'rm -rf "$tmp"' EXIT
 log=$tmp/log
@@ -87,6 +87,18 @@ for picture in error-seconds-cornell error-spp-cornell cost; do
 done
 [ $status -ne 9 ] && grep -q '"relmse": ' "$tmp/out-same/rows.json" && grep -q '^| cornell | 2s | pt (b) |' "$tmp/out-same/table.md"
 report $? 'plots, JSON and a table are written'
+
+# A reference that tells its own error, at twice the picture's size: a quarter of it is in the rows.
+mkdir "$tmp/known"
+"$reference" examples/scenes/cornell.xml --size 64x36 --round-spp 2 --check-spp 2 --rounds 16 --measured 1 --quiet \
+    --state "$tmp/state" -o "$tmp/known/cornell.exr" >"$tmp/log" 2>&1
+"$rig" --jobs 1 --scenes cornell --size 32x18 --references "$tmp/known" --builds "a=$render" --out "$tmp/out-known" --spp 2 --seeds 1 \
+    --methods pt,sdtree >"$tmp/log" 2>&1
+own=$(tr -c '[:print:]' '\n' <"$tmp/known/cornell.exr" | sed -n 's/.*\(0\.[0-9]*\) (untrimmed.*/\1/p')
+awk -F, -v own="$own" 'NR == 2 { for (i = 1; i <= NF; ++i) if ($i == "reference_relmse") at = i }
+    NR == 3 { good = own > 0 && $at > 0.249 * own && $at < 0.251 * own } END { exit !good }' "$tmp/out-known/rows.csv" &&
+    grep -qE '^\| cornell \| 2spp \| sdtree .* \| [0-9.]+ \| [0-9.]+ \| [0-9.]+x \|$' "$tmp/out-known/table.md"
+report $? "the reference's own error, at the size of the picture"
 
 # A training is a budget's first number, and the axis of the plots; what does not learn goes without.
 measure trained "$render" --train 2,4 --spp 4 --seeds 2 --methods pt,sdtree:denoise=off,sdtree

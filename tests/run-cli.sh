@@ -317,8 +317,11 @@ completes 'make_reference: --add takes an earlier picture in' $make --state part
 report $? 'make_reference: the header tells what was added'
 refuses 'make_reference: the same rounds are not added twice' 'seed 1000000.*choose another' $make --state parts -o parts/no.exr \
     --add parts/sum.exr
-sed 's/4,4,4/9,9,9/' good.xml >bright.xml
-refuses 'make_reference: a picture of another scene is not added' 'differs from the rounds' bright.xml $make_options --seed 2 \
+refuses 'make_reference: a picture of other settings is not added' "is of 'good.xml --size 64x36', not of" $make --seed 2 \
+    --max-depth 3 --state parts -o parts/no.exr --add whole/r.exr
+mkdir bright
+sed 's/4,4,4/9,9,9/' good.xml >bright/good.xml
+refuses 'make_reference: a picture of another scene is not added' 'differs from the rounds' bright/good.xml $make_options --seed 2 \
     --state parts -o parts/no.exr --rounds 16 --add whole/r.exr
 "$render" good.xml --size 64x36 --spp 1 -o plain.exr >out 2>log
 refuses 'make_reference: only a reference is added' 'does not tell its own error' $make --state parts -o parts/no.exr --seed 2 \

@@ -1,6 +1,6 @@
 /* uninitialised.c: learns small fields with guide_kd.h and guide_photon.h, asks them, trains and runs small networks of
-   guide_nn.h, and prints a hash of all of it. Built by uninitialised.sh with stack and heap filled with different bytes:
-   the hash may not depend on them. */
+   guide_nn.h, and prints a hash of all of it. Built by uninitialised.sh with stack and heap filled with different
+   bytes: the hash may not depend on them. */
 #include <stdio.h>
 #include <stdlib.h>
 
