@@ -115,6 +115,8 @@ int main(int argc, char **argv)
     static float image[3][PIXELS]; // unguided, guided, reference
     double error[2] = {0, 0};
     int passes = argc > 1 ? atoi(argv[1]) : 7;
+    if (passes < 1 || passes > 12)
+        return fputs("usage: kd [number of passes, 1 to 12]\n", stderr), 2;
     gkd_desc desc = {.bounds_max = {3, 2, 1.5f}}; // the rest: defaults
     gkd_field *field;
     gkd_stream *stream;
@@ -144,7 +146,5 @@ int main(int argc, char **argv)
     }
     printf("squared error, %d samples a pixel: %.2e unguided, %.2e guided\n", (1 << passes) - 1, error[0], error[1]);
     fclose(file);
-    gkd_stream_destroy(stream);
-    gkd_destroy(field);
-    return 0;
+    return gkd_stream_destroy(stream), gkd_destroy(field), 0;
 }

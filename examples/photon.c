@@ -11,8 +11,8 @@ enum { SIZE = 64, DEPTH = 12 }; /* pixels across, path length */
 #define ALBEDO 0.7f
 #define PI 3.14159265f
 
-static const float room[3] = {2, 1, 1};                  /* corner opposite to the origin */
-static const float lamp[2] = {1.6f, 0.3f}, half = 0.05f; /* on the ceiling */
+/* The room's corner opposite to the origin; the lamp on its ceiling. */
+static const float room[3] = {2, 1, 1}, lamp[2] = {1.6f, 0.3f}, half = 0.05f;
 
 static float random_float(void)
 {
@@ -57,9 +57,8 @@ static void trace_photon(gph_stream *stream)
 {
     float p[3] = {lamp[0] + half * (2 * random_float() - 1), lamp[1] + half * (2 * random_float() - 1), 1}, d[3];
     int axis = 2;
-    float side = -1;
+    float side = -1, unused;
     do {
-        float unused;
         scatter(axis, side, d);
         float distance = trace(p, d, &axis, &side, &unused), back[3] = {-d[0], -d[1], -d[2]};
         gph_photon photon = gph_make_photon(p, back, distance, 1); /* every path has the same power */
@@ -136,6 +135,8 @@ static double render(int passes, gph_field *field, gph_stream *stream, double *m
 int main(int argc, char **argv)
 {
     int passes = argc > 1 ? atoi(argv[1]) : 6;
+    if (passes < 1 || passes > 12)
+        return fputs("usage: photon [number of passes, 1 to 12]\n", stderr), 2;
     gph_desc desc = {.grid_cells = 16}; /* few photons: large voxels at first; the rest: defaults */
     gph_field *field;
     gph_stream *stream;
@@ -144,7 +145,5 @@ int main(int argc, char **argv)
         return 1;
     double unguided = render(passes, field, NULL, &mean[0]), guided = render(passes, field, stream, &mean[1]);
     printf("means %.4g and %.4g; guided / unguided variance: %.3g\n", mean[0], mean[1], guided / unguided);
-    gph_stream_destroy(stream);
-    gph_destroy(field);
-    return 0;
+    return gph_stream_destroy(stream), gph_destroy(field), 0;
 }

@@ -1,5 +1,4 @@
 /* plain.c: path guiding with nothing but guide_sdtree.h and the C library.
-
    cc -O2 -I. examples/plain.c -o plain -lm && ./plain
 
    A room of 2 x 1 x 1 m whose lamp is behind a wall with a door ajar. The floor of the dark half is rendered twice with
@@ -131,6 +130,8 @@ int main(int argc, char **argv)
 {
     static float image[2 * SIZE * SIZE];
     int passes = argc > 1 ? atoi(argv[1]) : 7;
+    if (passes < 1 || passes > 12)
+        return fputs("usage: plain [number of passes, 1 to 12]\n", stderr), 2;
     gsd_desc desc = {.bounds_max = {room[0], room[1], room[2]}}; /* the rest: defaults */
     gsd_field *field;
     gsd_stream *stream;

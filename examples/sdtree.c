@@ -115,6 +115,8 @@ int main(int argc, char **argv)
     static float image[3][PIXELS]; // unguided, guided, reference
     double error[2] = {0, 0};
     int passes = argc > 1 ? atoi(argv[1]) : 7;
+    if (passes < 1 || passes > 12)
+        return fputs("usage: sdtree [number of passes, 1 to 12]\n", stderr), 2;
     gsd_desc desc = {.bounds_max = {3, 2, 1.5f}, .target = GSD_TARGET_SIMPLE}; // the rest: defaults
     gsd_field *field;
     gsd_stream *stream;
@@ -144,7 +146,5 @@ int main(int argc, char **argv)
     }
     printf("squared error, %d samples a pixel: %.2e unguided, %.2e guided\n", (1 << passes) - 1, error[0], error[1]);
     fclose(file);
-    gsd_stream_destroy(stream);
-    gsd_destroy(field);
-    return 0;
+    return gsd_stream_destroy(stream), gsd_destroy(field), 0;
 }

@@ -1,14 +1,16 @@
 #!/usr/bin/env bash
-# Run test programs (cmocka, TAP), the compile matrix and the command-line tests, several at a time; say how long each
-# test took and how many CPU seconds each program; end with the slowest tests and
+# Run test programs (cmocka, TAP), the compile matrix and the command-line tests, several at a time; say what starts
+# (".. NAME"), then how long each test took and how many CPU seconds each program; end with the slowest tests and
 #   N passed, N failed
 # Exit status 1 where a test failed, a program crashed, or fewer tests ran than tests/expected-count says.
 # Environment: BUILD folder, CONFIG, CC, TESTS = names to run (empty = all; "matrix", "uninitialised", "rig" and "cli"
-# are names too), TEST_FILTER = pattern of the names of cmocka's tests, TEST_JOBS = programs at a time (the processors;
-# the rig times programs and is always alone), RECORD=1 rewrites tests/expected-count.
+# are names too), TEST_FILTER = pattern of the names of cmocka's tests (scripts run then only where TESTS names them),
+# TEST_JOBS = programs at a time (the processors, at most 8; the rig times programs and is always alone), RECORD=1
+# rewrites tests/expected-count.
 export LC_ALL=C
 cd "$(dirname "$0")/.." || exit 1
-: "${BUILD:=build}" "${CONFIG:=release}" "${CC:=cc}" "${TEST_JOBS:=$(nproc 2>/dev/null || echo 2)}"
+processors=$(nproc 2>/dev/null || echo 2) # which does not know what share of them a container may use
+: "${BUILD:=build}" "${CONFIG:=release}" "${CC:=cc}" "${TEST_JOBS:=$((processors < 8 ? processors : 8))}"
 export BUILD CONFIG CC
 export CMOCKA_MESSAGE_OUTPUT=TAP
 export ASAN_OPTIONS="detect_leaks=1:allocator_may_return_null=1:${ASAN_OPTIONS-}"
@@ -22,7 +24,9 @@ if [ "$CONFIG" = tsan ] && [ -z "${UNRANDOMISED-}" ] && setarch -R true 2>/dev/n
 fi
 
 tmp=$(mktemp -d) || exit 1
-trap 'rm -rf "$tmp"' EXIT
+# Each worker leads a process group, so that an interrupt ends what it runs too.
+set -m
+trap 'exec 2>/dev/null; for job in $(jobs -p); do kill -- "-$job"; done; rm -rf "$tmp"' EXIT
 microseconds() { # bash 5 has a fine clock; others count in seconds
     local t=${EPOCHREALTIME:-$(date +%s).000000}
     echo "${t/./}"
@@ -81,7 +85,7 @@ run() {
         complain "stopped after $((p + f + s - 1)) of $plan tests"
         echo "       FAIL  stopped early"
     fi
-    want=1
+    want=0 # a filter need not match in every program; at the end some test must have run
     [ -n "${TEST_FILTER-}" ] || want=$(sed -n "s/^$name //p" tests/expected-count 2>/dev/null)
     if [ -z "${RECORD-}" ] && [ $((p + f + s)) -lt "${want:-1}" ]; then
         f=$((f + 1))
@@ -94,7 +98,9 @@ run() {
     echo "$p $f $s $plan $cpu" >"$tmp/$name.counts"
 }
 
-wanted() { [ -z "${TESTS-}" ] || case " $TESTS " in *" $1 "*) true ;; *) false ;; esac; }
+wanted() { # a script; filters are for the programs
+    if [ -n "${TESTS-}" ]; then case " $TESTS " in *" $1 "*) true ;; *) false ;; esac; else [ -z "${TEST_FILTER-}" ]; fi
+}
 
 # What runs, longest first. The matrix compiles the headers by itself: once is enough, not once per configuration.
 names=() commands=()
@@ -104,6 +110,16 @@ if [ -x "$BUILD/render" ] && wanted cli; then plan cli 'bash tests/run-cli.sh'; 
 for program in "$@"; do plan "$(basename "$program")" "$program"; done
 if [ "$CONFIG" = release ] && wanted uninitialised; then plan uninitialised 'bash tests/uninitialised.sh'; fi
 
+# say COMMAND...: when no other worker prints.
+say() {
+    until mkdir "$tmp/saying" 2>/dev/null; do
+        [ -d "$tmp" ] || exit 1
+        sleep 0.05
+    done
+    "$@"
+    rmdir "$tmp/saying"
+}
+
 # worker: run what no other worker has taken; where there are others, say all of a program at once.
 worker() {
     local i
@@ -112,17 +128,20 @@ worker() {
         if [ "$TEST_JOBS" -eq 1 ] || [ ${#names[@]} -eq 1 ]; then
             run "${names[i]}" ${commands[i]}
         else
+            say echo ".. ${names[i]}"
             run "${names[i]}" ${commands[i]} >"$tmp/${names[i]}.log"
-            until mkdir "$tmp/saying" 2>/dev/null; do sleep 0.05; done
-            cat "$tmp/${names[i]}.log"
-            rmdir "$tmp/saying"
+            say cat "$tmp/${names[i]}.log"
         fi
     done
 }
-for ((job = 0; job < TEST_JOBS; ++job)); do worker & done
+for ((job = 0; job < TEST_JOBS; ++job)); do worker </dev/null & done
 wait
 # Times: only the fast build's say anything, and only alone.
-if [ "$CONFIG" = release ] && wanted rig; then plan rig '' && run rig bash tests/rig.sh; fi
+if [ "$CONFIG" = release ] && wanted rig; then
+    plan rig ''
+    run rig bash tests/rig.sh </dev/null &
+    wait
+fi
 
 passed=0 failed=0 skipped=0 recorded=
 for name in "${names[@]}"; do
@@ -136,7 +155,7 @@ if [ -n "${RECORD-}" ]; then
         echo "# How many tests each program has at least; rewritten by: make expected-count"
         printf '%s' "$recorded"
     } >tests/expected-count
-elif [ -z "${TESTS-}" ] && [ -e tests/expected-count ]; then
+elif [ -z "${TESTS-}${TEST_FILTER-}" ] && [ -e tests/expected-count ]; then
     # Whatever is listed must have run.
     while read -r name count; do
         case $name in '#' | '') continue ;; esac

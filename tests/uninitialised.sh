@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Does a field or network depend on what its memory held before? The same learning with stack and heap filled with zeros and with
-# other bytes must give the same bits. (Address sanitizers do not look for that.) Speaks TAP.
+# Does a field or network depend on what its memory held before? The same learning with stack and heap filled with zeros
+# and with other bytes must give the same bits. (Address sanitizers do not look for that.) Speaks TAP.
 export LC_ALL=C
 cd "$(dirname "$0")/.." || exit 1
 tmp=$(mktemp -d) || exit 1
