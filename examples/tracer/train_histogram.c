@@ -12,14 +12,13 @@
      >>data     examples               >>train  steps, checkpoints, curve
      >>fields   inputs                 >>main
      >>dense    truths */
+#include "bench/plot.h"
 #include "photon_net.h"
 #include "scene_internal.h"
 #include "threads.h"
 
 #include <stdlib.h>
 #include <string.h>
-
-#include "../bench/plot.h"
 
 /* ---- >>options ---------------------------------------------------------------------------------------------- */
 
