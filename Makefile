@@ -146,9 +146,6 @@ $(B)/obj/tracer/%.o: examples/tracer/%.c $(B)/flags
 	$(Q)mkdir -p $(@D)
 	$(Q)$(CC) $(CFLAGS_ALL) $(TRACER_FLAGS) $(CPPFLAGS_ALL) -MMD -MP -c $< -o $@
 
-# Where --set net=on finds its weights, whatever the folder it is called from.
-$(B)/obj/tracer/photon_net.o: TRACER_FLAGS += -DTR_WEIGHTS='"$(abspath examples/weights)"'
-
 $(B)/obj/tracer/%.o: examples/tracer/%.cpp $(B)/flags
 	$(SAY) CXX $<
 	$(Q)mkdir -p $(@D)
