@@ -35,8 +35,9 @@ void *pn_read_file(const char *path, size_t *size);
 typedef struct photon_net photon_net;
 
 /* Read the weights; path NULL = those that come with the renderer: examples/weights/histogram.safetensors beside the
-   folder of the running program, where the system tells it, else in the working directory. share: of the CPU time spent so far that the network
-   may take, counted in work, not measured. tiles: that photon_net_see is told. NULL with a reason in err. */
+   folder of the running program, where the system tells it, else in the working directory. share: of the CPU time spent
+   so far that the network may take, counted in work, not measured. tiles: that photon_net_see is told. NULL with a
+   reason in err. */
 photon_net *photon_net_create(const char *path, double share, int tiles, char *err, size_t err_size);
 void photon_net_destroy(photon_net *net);
 /* Vertices of camera paths, to know which voxels they need most. One thread per tile at a time. */

@@ -1093,8 +1093,8 @@ static bool parse_channels(const char *text, uint32_t channels[GNN_MAX_LEVELS])
 
 static void refuse_number(const char *key, const char *value, double low, double high, bool whole)
 {
-    fprintf(stderr, "train_histogram: %s %s: %s of %g .. %g is needed\n", key, value, whole ? "a whole number" : "a number",
-            low, high);
+    fprintf(stderr, "train_histogram: %s %s: %s of %g .. %g is needed\n", key, value,
+            whole ? "a whole number" : "a number", low, high);
     exit(1);
 }
 
@@ -1104,16 +1104,11 @@ static bool set_number(options *o, const char *key, const char *value)
         const char *key;
         double *to, low, high;
         bool whole;
-    } numbers[] = {{"--rooms", &o->rooms, 1, 1e5, true},
-                   {"--room-seconds", &o->room_seconds, 0, 1e6, false},
-                   {"--seconds", &o->seconds, 0, 1e8, false},
-                   {"--steps", &o->steps, 0, 1e9, true},
-                   {"--seed", &o->seed, 0, 1e9, true},
-                   {"--threads", &o->threads, 1, 256, true},
-                   {"--batch", &o->batch, 1, 1024, true},
-                   {"--rate", &o->rate, 0, 1, false},
-                   {"--lambda", &o->lambda, 0, 1000, false},
-                   {"--deep", &o->deep, 0, 1000, false}};
+    } numbers[] = {{"--rooms", &o->rooms, 1, 1e5, true},      {"--room-seconds", &o->room_seconds, 0, 1e6, false},
+                   {"--seconds", &o->seconds, 0, 1e8, false}, {"--steps", &o->steps, 0, 1e9, true},
+                   {"--seed", &o->seed, 0, 1e9, true},        {"--threads", &o->threads, 1, 256, true},
+                   {"--batch", &o->batch, 1, 1024, true},     {"--rate", &o->rate, 0, 1, false},
+                   {"--lambda", &o->lambda, 0, 1000, false},  {"--deep", &o->deep, 0, 1000, false}};
     for (size_t k = 0; k < sizeof numbers / sizeof *numbers; ++k)
         if (!strcmp(key, numbers[k].key)) {
             char *end;
