@@ -432,4 +432,16 @@ refuses 'train_histogram: makes a room, too dark to train on' 'too few rooms' --
 report $? 'train_histogram: writes its data'
 program=$render
 
+# ---- the network's weights: beside the program, whatever the working directory
+if [ -e /proc/self/exe ]; then
+    completes 'net=on finds its weights from another folder' good.xml --method photon --set net=on $quick
+    mkdir elsewhere
+    cp "$render" elsewhere/render
+    program=elsewhere/render
+    refuses 'net=on without weights: where, and what to do' \
+        'weights examples/weights/histogram.safetensors: No such file.*elsewhere/\.\./examples/weights/.*--set net=FILE' \
+        good.xml --method photon --set net=on $quick
+    program=$render
+fi
+
 finish

@@ -784,7 +784,8 @@ enum { SHARES = 3 };
 static const double uniform_shares[SHARES] = {0.01, 0.1, 0.5};
 
 /* How good a map is to sample: second moment over squared mean of the estimator of the truth's integral by it, mixed
-   with uniform directions; 1 = perfect. The truth's halves are independent: so their noise adds nothing. And L1. */
+   with uniform directions; 1 = perfect. The truth's halves are independent, so that noise of their bins does not raise
+   its expectation. And L1, which has that noise. */
 typedef struct score {
     double v[SHARES], l1;
 } score;
