@@ -92,13 +92,11 @@ endif
 # ---- files ----------------------------------------------------------------------------------------------------
 
 HEADERS := $(wildcard guide_*.h)
-TRACER_MAINS := render imgerr
+TRACER_MAINS := render imgerr train_histogram
 TRACER_SRC := $(filter-out $(TRACER_MAINS:%=examples/tracer/%.c),$(wildcard examples/tracer/*.c))
 TRACER_OBJ := $(TRACER_SRC:examples/tracer/%.c=$(B)/obj/tracer/%.o) $(if $(OPENPGL_DIR),$(B)/obj/tracer/method_openpgl.o)
 PROGRAMS := $(patsubst examples/tracer/%.c,$(B)/%,$(wildcard $(TRACER_MAINS:%=examples/tracer/%.c)))
-# Programs of examples/ that need the renderer.
-EXAMPLE_TOOLS := $(B)/train_histogram
-EXAMPLES := $(patsubst examples/%.c,$(B)/examples/%,$(filter-out $(EXAMPLE_TOOLS:$(B)/%=examples/%.c),$(wildcard examples/*.c)))
+EXAMPLES := $(patsubst examples/%.c,$(B)/examples/%,$(wildcard examples/*.c))
 TESTS_ALL := $(patsubst tests/%.c,$(B)/tests/%,$(wildcard tests/test_*.c))
 # The other tests are of the headers alone.
 TRACER_TESTS := bsdf image light photon_net photon_pass render scene
@@ -124,7 +122,7 @@ SUB = +@$(MAKE) --no-print-directory $(JOBS)
 all: check-deps
 	$(SUB) programs
 
-programs: $(PROGRAMS) $(EXAMPLES) $(EXAMPLE_TOOLS) $(TESTS_ALL) $(STRESSES) $(BENCHES) $(BENCH_TOOLS)
+programs: $(PROGRAMS) $(EXAMPLES) $(TESTS_ALL) $(STRESSES) $(BENCHES) $(BENCH_TOOLS)
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
@@ -147,9 +145,6 @@ $(B)/obj/tracer/%.o: examples/tracer/%.c $(B)/flags
 	$(SAY) CC $<
 	$(Q)mkdir -p $(@D)
 	$(Q)$(CC) $(CFLAGS_ALL) $(TRACER_FLAGS) $(CPPFLAGS_ALL) -MMD -MP -c $< -o $@
-
-# Where --set net=on finds its weights, whatever the folder it is called from.
-$(B)/obj/tracer/photon_net.o: TRACER_FLAGS += -DTR_WEIGHTS='"$(abspath examples/weights)"'
 
 $(B)/obj/tracer/%.o: examples/tracer/%.cpp $(B)/flags
 	$(SAY) CXX $<
@@ -174,10 +169,6 @@ $(B)/libtracer.a: $(TRACER_OBJ)
 LINK = $(Q)mkdir -p $(@D) && $(CC) $(LDFLAGS_ALL) $(filter %.o %.a,$^)
 
 $(PROGRAMS): $(B)/%: $(B)/obj/tracer/%.o $(B)/libtracer.a
-	$(SAY) LD $@
-	$(LINK) $(LIBS) -o $@
-
-$(EXAMPLE_TOOLS): $(B)/%: $(B)/obj/examples/%.o $(B)/libtracer.a
 	$(SAY) LD $@
 	$(LINK) $(LIBS) -o $@
 

@@ -242,12 +242,16 @@ static double bench_net(const char *name, const uint32_t *channels, uint32_t lev
     return forward;
 }
 
-/* The same network by oneDNN: the ns of the better of its two ways; 0 = not built. */
+#ifdef BENCH_DNNL
+static bool peer_alone; /* oneDNN has one thread: there is something to compare */
+#endif
+
+/* The same network by oneDNN: the ns of the better of its two ways; 0 = not built, or not comparable. */
 static double bench_peer(const uint32_t *channels, int levels, double operations)
 {
     double best = 0;
 #ifdef BENCH_DNNL
-    for (int winograd = 0; winograd < 2; ++winograd) {
+    for (int winograd = 0; peer_alone && winograd < 2; ++winograd) {
         static peer p;
         bench_time t;
         char name[80];
@@ -301,7 +305,7 @@ int main(int argc, char **argv)
     static const gnn_simd all[] = {GNN_SIMD_AVX512, GNN_SIMD_AVX2, GNN_SIMD_NEON, GNN_SIMD_SCALAR};
     static const char *const names[] = {"AVX-512", "AVX2", "NEON", "no SIMD"};
 #ifdef BENCH_DNNL
-    peer_one_thread(argv);
+    peer_alone = peer_one_thread(argv);
 #endif
     for (int i = 1; i < argc; ++i)
         if (!strcmp(argv[i], "--quick"))

@@ -41,13 +41,17 @@ static void peer_check(dnnl_status_t status, const char *what)
     }
 }
 
-/* oneDNN asks OpenMP for its threads when it is loaded: begin again with one. */
-static void peer_one_thread(char **argv)
+/* oneDNN asks OpenMP for its threads when it is loaded: begin again with one. False = that cannot be: timings of it
+   would be of several threads. */
+static bool peer_one_thread(char **argv)
 {
-    if (getenv("OMP_NUM_THREADS"))
-        return;
+    const char *threads = getenv("OMP_NUM_THREADS");
+    if (threads && !strcmp(threads, "1"))
+        return true;
     setenv("OMP_NUM_THREADS", "1", 1);
     execv("/proc/self/exe", argv);
+    fprintf(stderr, "bench_nn: cannot begin again with OMP_NUM_THREADS=1: set it to compare with oneDNN\n");
+    return false;
 }
 
 static dnnl_memory_desc_t peer_desc(int n, int c, int h, int w, dnnl_format_tag_t tag)

@@ -12,12 +12,12 @@
 #include "cmocka_alone.h"
 #else
 #include <cmocka.h>
-#endif
 
 __attribute__((constructor)) static void filter_tests(void)
 {
     if (getenv("TEST_FILTER"))
         cmocka_set_test_filter(getenv("TEST_FILTER"));
 }
+#endif
 
 #endif

@@ -9,6 +9,7 @@ imgerr=$PWD/${BUILD:-build}/imgerr
 field=$PWD/${BUILD:-build}/bench_field
 fields=$PWD/bench/fields
 make_reference=$PWD/${BUILD:-build}/make_reference
+train_histogram=$PWD/${BUILD:-build}/train_histogram
 program=$render
 tmp=$(mktemp -d) || exit 1
 trap 'rm -rf "$tmp"' EXIT
@@ -360,6 +361,90 @@ echo '<scene/>' >inner.xml
 "$program" files.xml --size 8x8 --round-spp 1 --check-spp 1 --rounds 1 --quiet --measured 1 --state files -o f.exr >out 2>>log
 [ "$(ls files/*.state | wc -l)" -eq 4 ] && [ $made -eq 3 ]
 report $? 'make_reference: another mesh or included file is another state'
+
+# ---- train_histogram
+program=$train_histogram
+# said NAME PATTERN: the last run's output has it.
+said() {
+    cat out >>log
+    grep -qE -- "$2" log
+    status=$? why="nothing matches: $2"
+    report $status "$1"
+}
+# untouched NAME FILE WAS: the file is what it was.
+untouched() {
+    cmp "$2" "$3" >log 2>&1
+    report $? "$1"
+}
+for value in '--batch 0' '--batch 1.5' '--batch 1e9' '--threads 0' '--rooms -1' '--seed nan' '--steps 1x'; do
+    refuses "train_histogram: $value" "${value%% *} .* is needed" $value
+done
+for value in abc 8,,16 8, 0 8,1000 1,1,1,1,1,1,1; do
+    refuses "train_histogram: --channels $value" 'channels: one to six whole numbers' --channels $value
+done
+refuses 'train_histogram: unknown option' 'frobnicate: unknown' --frobnicate 1
+refuses 'train_histogram: option without its value' 'seed: .*without its value' --seed
+refuses 'train_histogram: --scene with --data' 'scene: .*leave out --data' --scene good.xml --data absent
+
+# A data set by hand: one map to train, one held out, all values alike. safetensors are a length, JSON, numbers.
+data_set() { # data_set FILE RUN
+    local train=$((7 * 2048 * 2)) held=$((12 * 2048 * 2)) json length
+    json="{\"__metadata__\":{\"rooms\":\"1\",\"run\":\"$2\"}
+,\"train.maps\":{\"dtype\":\"F16\",\"shape\":[1,7,32,64],\"data_offsets\":[0,$train]}
+,\"train.photons\":{\"dtype\":\"F32\",\"shape\":[1,2],\"data_offsets\":[$train,$((train + 8))]}
+,\"held.maps\":{\"dtype\":\"F16\",\"shape\":[1,12,32,64],\"data_offsets\":[$((train + 8)),$((train + held + 8))]}
+,\"held.photons\":{\"dtype\":\"F32\",\"shape\":[1,2],\"data_offsets\":[$((train + held + 8)),$((train + held + 16))]}}"
+    length=${#json}
+    printf "\\$(printf %o $((length % 256)))\\$(printf %o $((length / 256)))\0\0\0\0\0\0%s" "$json" >"$1"
+    head -c $((train + held + 16)) /dev/zero | tr '\0' '<' >>"$1"
+}
+data_set maps 'seed 1, 0 CPU seconds a room'
+net="--channels 4,4 --data maps --checkpoint net"
+completes 'train_histogram: trains' $net --steps 3 --weights half --curve curve.svg
+said 'train_histogram: says that it begins' 'net is not there: begun anew'
+[ -s net ] && [ -s half ] && [ -s net.curve ] && grep -q '</svg>' curve.svg
+report $? 'train_histogram: writes checkpoint, weights, curve'
+completes 'train_histogram: goes on from its checkpoint' $net --steps 5
+said 'train_histogram: says from where' '^net: step 3,'
+cp net net.was
+cp net.curve curve.was
+completes 'train_histogram: judges without a step' $net --seconds 0
+untouched 'train_histogram: judging leaves the checkpoint' net net.was
+untouched 'train_histogram: judging leaves the curve' net.curve curve.was
+head -c 2000 net.was >net
+cp net broken
+refuses 'train_histogram: a broken checkpoint' '^train_histogram: net: ' $net --steps 9
+untouched 'train_histogram: a broken checkpoint stays' net broken
+sed 's/"cpu_seconds":"[0-9.]*/"cpu_seconds":"nan/' net.was >net
+refuses 'train_histogram: a checkpoint whose time is no number' '^train_histogram: net: ' $net --steps 9
+mkdir folder
+refuses 'train_histogram: a checkpoint that cannot be read' 'folder: is a directory' --channels 4,4 --data maps --checkpoint folder --steps 9
+refuses 'train_histogram: data that cannot be read' 'folder: is a directory' --channels 4,4 --data folder --steps 9
+# What an interrupted run has made of its rooms is gone on with, not taken for all.
+mv maps rooms.part
+room="--channels 4,4 --data rooms --checkpoint third --steps 1 --rooms 1 --room-seconds 0"
+refuses 'train_histogram: rooms of another seed are not gone on with' 'rooms.part: .*another --seed' $room --seed 2
+[ ! -e rooms ] && [ -e rooms.part ]
+report $? 'train_histogram: rooms of another seed stay'
+completes 'train_histogram: goes on with rooms' $room
+said 'train_histogram: says after how many' 'rooms.part: going on after 1 rooms'
+[ -e rooms ] && [ ! -e rooms.part ]
+report $? 'train_histogram: all rooms become the data'
+refuses 'train_histogram: makes a room, too dark to train on' 'too few rooms' --data fourth --rooms 1 --room-seconds 0 --seed 3
+[ -s fourth ] && [ ! -e fourth.part ]
+report $? 'train_histogram: writes its data'
 program=$render
+
+# ---- the network's weights: beside the program, whatever the working directory
+if [ -e /proc/self/exe ]; then
+    completes 'net=on finds its weights from another folder' good.xml --method photon --set net=on $quick
+    mkdir elsewhere
+    cp "$render" elsewhere/render
+    program=elsewhere/render
+    refuses 'net=on without weights: where, and what to do' \
+        'weights examples/weights/histogram.safetensors: No such file.*elsewhere/\.\./examples/weights/.*--set net=FILE' \
+        good.xml --method photon --set net=on $quick
+    program=$render
+fi
 
 finish

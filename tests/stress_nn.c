@@ -652,7 +652,7 @@ static void small_workspaces(stress *s)
     gnn_unet_desc d = any_desc(s);
     gnn_unet *net = new_net(s, &d);
     batch b = new_batch(s, &d, 2, false);
-    float *g = new_floats(gnn_unet_floats(net)), *before = new_floats(gnn_unet_floats(net));
+    float *before = new_floats(gnn_unet_floats(net));
     memcpy(before, net->weights, net->floats * sizeof(float));
     for (int i = 0; i < 12; ++i) {
         bool train = stress_chance(s, 0.5);
@@ -677,7 +677,6 @@ static void small_workspaces(stress *s)
         free_space(s, &w);
         stress_end(s, result != GNN_OK);
     }
-    free(g);
     free(before);
     free_batch(&b);
     gnn_unet_destroy(net);

@@ -6,15 +6,16 @@
      >>refine   which maps, and how many */
 #include "photon_net.h"
 
+#include <errno.h>
+#include <float.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #define GNN_IMPLEMENTATION
 #include "guide_nn.h"
 
-#ifndef TR_WEIGHTS /* folder of the weights */
-#define TR_WEIGHTS "examples/weights"
-#endif
+#define WEIGHTS "examples/weights/histogram.safetensors"
 
 /* ---- >>maps ------------------------------------------------------------------------------------------------- */
 
@@ -37,15 +38,15 @@ gnn_unet_desc pn_desc(void)
    (Anscombe 1948), and a few bright ones do not outweigh the rest of a map. */
 static float bend(float x) { return x > 0 ? sqrtf(x) : 0; }
 
-/* Divided by its mean; all 1 where it has none. */
+/* Divided by its mean; all 1 where that is nothing, infinite or so small that its values are no longer whole floats. */
 static void normalise(float *map)
 {
     double sum = 0;
     for (int i = 0; i < PN_AREA; ++i)
         sum += (double)map[i];
-    float scale = sum > 0 && sum < INFINITY ? (float)(PN_AREA / sum) : 0;
+    double scale = sum >= (double)PN_AREA * (double)FLT_MIN && sum < INFINITY ? PN_AREA / sum : 0;
     for (int i = 0; i < PN_AREA; ++i)
-        map[i] = scale > 0 ? map[i] * scale : 1;
+        map[i] = scale > 0 ? (float)((double)map[i] * scale) : 1;
 }
 
 void pn_inputs(const float *repaired, const float *features, float photons, float *inputs)
@@ -113,34 +114,62 @@ struct photon_net {
     float *inputs, *outputs, *maps;
 };
 
-static void *read_weights(const char *path, size_t *size)
+void *pn_read_file(const char *path, size_t *size)
 {
     FILE *f = fopen(path, "rb");
-    void *data = NULL;
-    long end;
-    if (f && !fseek(f, 0, SEEK_END) && (end = ftell(f)) > 0 && end < 64L << 20 && !fseek(f, 0, SEEK_SET)) {
-        data = malloc((size_t)end);
-        *size = data ? fread(data, 1, (size_t)end, f) : 0;
+    char *data = NULL;
+    long end = 0;
+    if (!f)
+        return NULL;
+    errno = 0;
+    (void)fgetc(f); /* a folder opens, but says here what it is */
+    if (!ferror(f) && !fseek(f, 0, SEEK_END) && (end = ftell(f)) >= 0 && !fseek(f, 0, SEEK_SET))
+        data = malloc((size_t)end + 1);
+    *size = data ? fread(data, 1, (size_t)end, f) : 0;
+    if (data && *size != (size_t)end) {
+        free(data);
+        data = NULL;
     }
-    if (f)
-        fclose(f);
+    int why = errno ? errno : EIO;
+    fclose(f);
+    errno = why;
     return data;
+}
+
+/* The weights beside the folder that the program runs from, whatever folder it is called from. */
+static bool beside_program(char *path, size_t size)
+{
+    ssize_t n = readlink("/proc/self/exe", path, size);
+    if (n <= 0 || (size_t)n >= size)
+        return false;
+    path[n] = 0;
+    char *name = strrchr(path, '/');
+    size_t room = name ? size - (size_t)(name - path) : 0;
+    return name && snprintf(name, room, "/../" WEIGHTS) < (int)room;
 }
 
 static bool load_weights(photon_net *n, const char *path, char *err, size_t err_size)
 {
     const char *remedy = "give others by --set net=FILE, restore the file, or train it with build/train_histogram";
+    char beside[1024];
+    bool looked = !path && beside_program(beside, sizeof beside);
     size_t size = 0;
-    void *data = read_weights(path, &size);
+    const char *named = path ? path : looked ? beside : WEIGHTS;
+    void *data = pn_read_file(named, &size);
     gnn_message message = {""};
+    if (!data && looked && errno == ENOENT)
+        data = pn_read_file(named = WEIGHTS, &size);
     if (!data) {
-        snprintf(err, err_size, "photon: cannot read the network's weights %s: %s", path, remedy);
+        const char *why = strerror(errno);
+        bool both = looked && named != beside;
+        snprintf(err, err_size, "photon: cannot read the network's weights %s: %s%s%s: %s", named, why,
+                 both ? "; nor is there " : "", both ? beside : "", remedy);
         return false;
     }
     gnn_result result = gnn_unet_load(n->unet, data, size, &message);
     free(data);
     if (result)
-        snprintf(err, err_size, "photon: the network's weights %s: %s: %s", path,
+        snprintf(err, err_size, "photon: the network's weights %s: %s: %s", named,
                  message.text[0] ? message.text : gnn_result_string(result), remedy);
     return !result;
 }
@@ -159,7 +188,7 @@ photon_net *photon_net_create(const char *path, double share, int tiles, char *e
     n->tiles = all;
     n->tile_count = tiles;
     n->share = share;
-    if (!load_weights(n, path ? path : TR_WEIGHTS "/histogram.safetensors", err, err_size)) {
+    if (!load_weights(n, path, err, err_size)) {
         photon_net_destroy(n);
         return NULL;
     }
@@ -309,8 +338,7 @@ bool photon_net_refine(photon_net *n, gph_field *field, tr_parallel_fn parallel,
             parallel(parallel_user, k, GRAIN, refine_range, n);
         else
             refine_range(n, 0, k);
-        gph_import_maps(field, n->voxels, k, n->maps, parallel, parallel_user);
-        n->done += k;
+        n->done += gph_import_maps(field, n->voxels, k, n->maps, parallel, parallel_user);
     }
     free(voxels);
     return ok;

@@ -12,14 +12,14 @@
      >>data     examples               >>train  steps, checkpoints, curve
      >>fields   inputs                 >>main
      >>dense    truths */
+#include "bench/plot.h"
 #include "photon_net.h"
 #include "scene_internal.h"
 #include "threads.h"
 
+#include <errno.h>
 #include <stdlib.h>
 #include <string.h>
-
-#include "../bench/plot.h"
 
 /* ---- >>options ---------------------------------------------------------------------------------------------- */
 
@@ -41,7 +41,7 @@ static void die(const char *what, const char *why)
 static void *need(void *p)
 {
     if (!p)
-        die("out of memory", "fewer rooms need less");
+        die("out of memory", "fewer rooms or a smaller --batch need less");
     return p;
 }
 
@@ -57,35 +57,49 @@ static vec3 colour(tr_rng *r, float low, float high)
     return chance(r, 0.6f) ? v3s(base) : v3(base, base * within(r, 0.4f, 1), base * within(r, 0.3f, 1));
 }
 
+static int add_bsdf(tr_scene *s, tr_bsdf_type type)
+{
+    int id = tr_scene_add_bsdf(s, type);
+    need(id < 0 ? NULL : s);
+    return id;
+}
+
+static int add_light(tr_scene *s, tr_light_type type)
+{
+    int id = tr_scene_add_light(s, type);
+    need(id < 0 ? NULL : s);
+    return id;
+}
+
 /* Diffuse, plastic, metal or glass; what is opaque on both sides. */
 static int any_bsdf(tr_scene *s, tr_rng *r, float smooth)
 {
     float u = rng_float(r);
     int id, two;
     if (u < smooth * 0.5f) {
-        id = tr_scene_add_bsdf(s, TR_BSDF_DIELECTRIC);
+        id = add_bsdf(s, TR_BSDF_DIELECTRIC);
         s->bsdfs[id].ior = within(r, 1.3f, 1.8f);
         return id;
     }
     if (u < smooth * 0.6f) {
-        id = tr_scene_add_bsdf(s, TR_BSDF_ROUGHDIELECTRIC);
+        id = add_bsdf(s, TR_BSDF_ROUGHDIELECTRIC);
         s->bsdfs[id].alpha.value = v3s(within(r, 0.05f, 0.4f));
         return id;
     }
     if (u < smooth * 0.9f) {
-        id = tr_scene_add_bsdf(s, TR_BSDF_ROUGHCONDUCTOR);
+        id = add_bsdf(s, TR_BSDF_ROUGHCONDUCTOR);
         s->bsdfs[id].alpha.value = v3s(log_within(r, 0.02f, 0.5f));
     } else if (u < smooth) {
-        id = tr_scene_add_bsdf(s, TR_BSDF_CONDUCTOR);
+        id = add_bsdf(s, TR_BSDF_CONDUCTOR);
     } else if (u < smooth + 0.2f) {
-        id = tr_scene_add_bsdf(s, TR_BSDF_ROUGHPLASTIC);
+        id = add_bsdf(s, TR_BSDF_ROUGHPLASTIC);
         s->bsdfs[id].reflectance.value = colour(r, 0.1f, 0.8f);
         s->bsdfs[id].alpha.value = v3s(log_within(r, 0.03f, 0.4f));
     } else {
-        id = tr_scene_add_bsdf(s, TR_BSDF_DIFFUSE);
+        id = add_bsdf(s, TR_BSDF_DIFFUSE);
         s->bsdfs[id].reflectance.value = colour(r, 0.1f, 0.85f);
     }
-    two = tr_scene_add_bsdf(s, TR_BSDF_TWOSIDED);
+    two = add_bsdf(s, TR_BSDF_TWOSIDED);
     s->bsdfs[two].child[0] = id;
     return two;
 }
@@ -112,8 +126,7 @@ static void add_cube(tr_scene *s, int bsdf, vec3 low, vec3 high)
 
 static void shine(tr_scene *s, tr_shape *shape, vec3 radiance)
 {
-    int id = (int)(shape - s->shapes), light = tr_scene_add_light(s, TR_LIGHT_AREA);
-    need(light < 0 ? NULL : s);
+    int id = (int)(shape - s->shapes), light = add_light(s, TR_LIGHT_AREA);
     s->lights[light].value = radiance;
     s->lights[light].shape = id;
     s->shapes[id].light = light;
@@ -150,8 +163,8 @@ static void add_walls(tr_scene *s, tr_rng *r, vec3 size, bool window)
     const float t = 0.1f;
     int bsdfs[3], open = (int)(rng_float(r) * 4);
     for (int k = 0; k < 3; ++k) {
-        int id = tr_scene_add_bsdf(s, TR_BSDF_DIFFUSE);
-        bsdfs[k] = tr_scene_add_bsdf(s, TR_BSDF_TWOSIDED);
+        int id = add_bsdf(s, TR_BSDF_DIFFUSE);
+        bsdfs[k] = add_bsdf(s, TR_BSDF_TWOSIDED);
         s->bsdfs[id].reflectance.value = colour(r, 0.2f, 0.85f);
         s->bsdfs[bsdfs[k]].child[0] = id;
     }
@@ -204,7 +217,7 @@ static void add_things(tr_scene *s, tr_rng *r, vec3 size, float smooth)
 
 static void add_spot(tr_scene *s, tr_rng *r, vec3 size, float power)
 {
-    int id = tr_scene_add_light(s, TR_LIGHT_SPOT);
+    int id = add_light(s, TR_LIGHT_SPOT);
     tr_light *l = &s->lights[id];
     float degrees = log_within(r, 1, 40);
     l->value = scale3(v3s(power), 1 / (1 - cosf(degrees * TR_PI / 180)));
@@ -249,7 +262,7 @@ static void add_lights(tr_scene *s, tr_rng *r, vec3 size, bool window)
 {
     int count = (int)(rng_float(r) * 3) + !window;
     if (window) {
-        int id = tr_scene_add_light(s, chance(r, 0.6f) ? TR_LIGHT_CONSTANT : TR_LIGHT_SUN);
+        int id = add_light(s, chance(r, 0.6f) ? TR_LIGHT_CONSTANT : TR_LIGHT_SUN);
         tr_light *l = &s->lights[id];
         l->value = v3s(5);
         if (l->type == TR_LIGHT_SUN) {
@@ -289,10 +302,11 @@ enum { REPAIRED, FEATURES, TRUTH_A = FEATURES + 4, TRUTH_B, TRAIN_PLANES };
 enum { SIGMA_07 = TRAIN_PLANES, SIGMA_14, SIGMA_28, PYRAMID, PULL_PUSH, HELD_PLANES };
 static const char *const filter_names[] = {"sigma 0.7", "sigma 1.4", "sigma 2.8", "pyramid", "pull-push"};
 enum { FIELDS = 1 + HELD_PLANES - TRAIN_PLANES };
+enum { HELD_EVERY = 6 }; /* one room of as many is held out */
 
 typedef struct set {
     float *maps;    /* [capacity][planes][PN_AREA] */
-    float *photons; /* [capacity][3]: of the input, of the truth, room */
+    float *photons; /* [capacity][2]: of the input, of the truth */
     uint32_t count, capacity, planes;
 } set;
 
@@ -301,7 +315,7 @@ static float *set_push(set *s)
     if (s->count == s->capacity) {
         s->capacity = s->capacity ? 2 * s->capacity : 256;
         s->maps = need(realloc(s->maps, (size_t)s->capacity * s->planes * PN_AREA * sizeof(float)));
-        s->photons = need(realloc(s->photons, (size_t)s->capacity * 3 * sizeof(float)));
+        s->photons = need(realloc(s->photons, (size_t)s->capacity * 2 * sizeof(float)));
     }
     return s->maps + (size_t)s->count++ * s->planes * PN_AREA;
 }
@@ -403,8 +417,10 @@ static uint64_t shoot(room *m, uint64_t seed, int index, uint32_t paths, tr_phot
 static void learn(room *m)
 {
     for (int k = 0; k < m->field_count; ++k) {
-        gph_accumulate(m->fields[k], &m->stream, 1, NULL, NULL);
-        need(gph_refine(m->fields[k], NULL, NULL) ? NULL : m);
+        gph_result result = gph_accumulate(m->fields[k], &m->stream, 1, NULL, NULL);
+        result = result ? result : gph_refine(m->fields[k], NULL, NULL);
+        if (result)
+            die("field", gph_result_string(result));
     }
     gph_stream_clear(m->stream);
 }
@@ -440,7 +456,7 @@ static void take_snapshot(room *m)
         uint32_t other = k + (uint32_t)(rng_float(&m->rng) * (float)(changed - k)), voxel = list[other];
         list[other] = list[k];
         uint32_t slot = m->set->count;
-        float *maps = set_push(m->set), *photons = m->set->photons + 3 * (size_t)slot;
+        float *maps = set_push(m->set), *photons = m->set->photons + 2 * (size_t)slot;
         take_maps(m, voxel, maps, photons);
         photons[1] = 0;
         s->slots[voxel] = slot;
@@ -471,7 +487,7 @@ static bool count_dense(void *user, int tile, const tr_photon *photons, int n)
                 continue;
             bin = bin == GPH_NONE ? gph_bin(PN_ROWS, PN_COLUMNS, from) : bin;
             set_map(m->set, slot)[(size_t)(TRUTH_A + m->half) * PN_AREA + bin] += mean3(p->flux) * (float)m->flux;
-            m->set->photons[3 * (size_t)slot + 1] += 1;
+            m->set->photons[2 * (size_t)slot + 1] += 1;
         }
     }
     return true;
@@ -482,7 +498,7 @@ static uint32_t keep_good(room *m)
 {
     uint32_t to = m->first;
     for (uint32_t i = m->first; i < m->set->count; ++i) {
-        const float *photons = m->set->photons + 3 * (size_t)i;
+        const float *photons = m->set->photons + 2 * (size_t)i;
         double sums[2] = {0, 0};
         for (int k = 0; k < 2 * PN_AREA; ++k)
             sums[k / PN_AREA] += (double)set_map(m->set, i)[TRUTH_A * PN_AREA + k];
@@ -490,7 +506,7 @@ static uint32_t keep_good(room *m)
             continue;
         if (to != i) {
             memcpy(set_map(m->set, to), set_map(m->set, i), (size_t)m->set->planes * PN_AREA * sizeof(float));
-            memcpy(m->set->photons + 3 * (size_t)to, photons, 3 * sizeof(float));
+            memcpy(m->set->photons + 2 * (size_t)to, photons, 2 * sizeof(float));
         }
         ++to;
     }
@@ -498,12 +514,27 @@ static uint32_t keep_good(room *m)
     return to - m->first;
 }
 
+/* Each half with mean 1, so that half-floats hold them and both count alike. */
+static void scale_truths(room *m)
+{
+    for (uint32_t i = m->first; i < m->set->count; ++i) {
+        float *truth = set_map(m->set, i) + TRUTH_A * PN_AREA;
+        for (int h = 0; h < 2; ++h, truth += PN_AREA) {
+            double sum = 0;
+            for (int k = 0; k < PN_AREA; ++k)
+                sum += (double)truth[k];
+            for (int k = 0; k < PN_AREA; ++k)
+                truth[k] = (float)((double)truth[k] * PN_AREA / sum);
+        }
+    }
+}
+
 /* Whether enough light of this room comes to voxels: elsewhere photons would be spent for few examples. */
 static bool worthwhile(const room *m, double begun, double seconds)
 {
     double per_example, sum = 0, used = tr_cpu_seconds() - begun;
     for (uint32_t i = m->first; i < m->set->count; ++i)
-        sum += (double)m->set->photons[3 * (size_t)i + 1];
+        sum += (double)m->set->photons[2 * (size_t)i + 1];
     per_example = sum / (m->set->count - m->first + 1);
     return m->set->count > m->first + 40 && (used < 0.1 * seconds || per_example * seconds > 8192 * used);
 }
@@ -566,9 +597,8 @@ static void run_room(const options *o, int number, set *to)
         m->half = k & 1;
         dense += shoot(m, seed * 2, k, 50000, count_dense);
     }
-    for (uint32_t i = m->first; i < to->count; ++i)
-        to->photons[3 * (size_t)i + 2] = (float)number;
     uint32_t taken = to->count - m->first, kept = keep_good(m);
+    scale_truths(m);
     fprintf(stderr,
             "room %d: %d lights, %s, grid %u, %d passes, %u voxels, photons %.2g, dense %.3g, %u of %u kept, %.1f s\n",
             number, m->scene->light_count, m->nee ? "nee" : "no nee", gph_get_desc(m->fields[0])->grid_cells, passes,
@@ -578,38 +608,45 @@ static void run_room(const options *o, int number, set *to)
 
 /* ---- >>files ------------------------------------------------------------------------------------------------ */
 
+/* NULL = there is none. One that is there and cannot be read is not for this program to write over. */
 static void *read_file(const char *path, size_t *size)
 {
-    FILE *f = fopen(path, "rb");
-    void *data = NULL;
-    long end;
-    if (f && !fseek(f, 0, SEEK_END) && (end = ftell(f)) > 0 && !fseek(f, 0, SEEK_SET)) {
-        data = need(malloc((size_t)end));
-        *size = fread(data, 1, (size_t)end, f);
-        if (*size != (size_t)end) {
-            free(data);
-            data = NULL;
-        }
-    }
-    if (f)
-        fclose(f);
+    void *data = pn_read_file(path, size);
+    if (!data && errno != ENOENT)
+        die(path, strerror(errno));
     return data;
+}
+
+enum { MOST_PATH = 1024 };
+
+static void suffixed(char name[MOST_PATH], const char *path, const char *suffix)
+{
+    if (snprintf(name, MOST_PATH, "%s%s", path, suffix) >= MOST_PATH)
+        die(path, "the name is too long");
 }
 
 /* Beside it first, then in its place: an interrupted write leaves the old file. */
 static void write_file(const char *path, const void *data, size_t size)
 {
-    char beside[1024];
-    snprintf(beside, sizeof beside, "%s.part", path);
+    char beside[MOST_PATH];
+    suffixed(beside, path, ".new");
     FILE *f = fopen(beside, "wb");
     bool ok = f && fwrite(data, 1, size, f) == size;
     ok = f && !fclose(f) && ok;
     if (!ok || rename(beside, path))
-        die(path, "cannot be written");
+        die(path, strerror(errno));
 }
 
-static void save_data(const char *path, const set sets[2])
+/* What tells one run of making data from another. */
+static void describe_run(const options *o, char text[64])
 {
+    snprintf(text, 64, "seed %.0f, %g CPU seconds a room", o->seed, o->room_seconds);
+}
+
+static void save_data(const options *o, const char *path, int rooms, const set sets[2])
+{
+    char made[16], run[64];
+    const char *metadata[] = {"rooms", made, "run", run, NULL};
     static const char *const names[2][2] = {{"train.maps", "train.photons"}, {"held.maps", "held.photons"}};
     gnn_weight w[4];
     memset(w, 0, sizeof w);
@@ -618,23 +655,27 @@ static void save_data(const char *path, const set sets[2])
         a->name = names[k][0], b->name = names[k][1];
         a->rank = 4, b->rank = 2;
         a->shape[0] = b->shape[0] = sets[k].count;
-        a->shape[1] = sets[k].planes, a->shape[2] = PN_ROWS, a->shape[3] = PN_COLUMNS, b->shape[1] = 3;
+        a->shape[1] = sets[k].planes, a->shape[2] = PN_ROWS, a->shape[3] = PN_COLUMNS, b->shape[1] = 2;
         a->values = sets[k].maps, b->values = sets[k].photons;
         a->type = GNN_TYPE_F16, b->type = GNN_TYPE_F32;
     }
-    size_t size = gnn_tensors_bound(w, 4, NULL);
-    void *data = need(malloc(size));
-    gnn_result result = gnn_tensors_write(w, 4, NULL, data, size, &size);
+    snprintf(made, sizeof made, "%d", rooms);
+    describe_run(o, run);
+    size_t size = gnn_tensors_bound(w, 4, metadata);
+    void *data = need(malloc(size ? size : 1));
+    gnn_result result = gnn_tensors_write(w, 4, metadata, data, size, &size);
     if (result)
         die(path, gnn_result_string(result));
     write_file(path, data, size);
     free(data);
 }
 
-static bool load_data(const char *path, set sets[2])
+/* rooms: NULL, or how many the file has of this very run, which is to be gone on with. False = no such file. */
+static bool load_data(const options *o, const char *path, int *rooms, set sets[2])
 {
     size_t size;
-    void *data = path ? read_file(path, &size) : NULL;
+    void *data = read_file(path, &size);
+    char text[64] = "", run[64];
     gnn_tensor tensors[8];
     uint32_t count;
     gnn_message message;
@@ -642,49 +683,64 @@ static bool load_data(const char *path, set sets[2])
         return false;
     if (gnn_tensors_read(data, size, tensors, 8, &count, &message))
         die(path, message.text);
+    describe_run(o, run);
+    if (rooms && (!gnn_tensors_metadata(data, size, "run", text, sizeof text) || strcmp(text, run)))
+        die(path, "was begun with another --seed or --room-seconds: give them again, or remove it");
+    if (rooms && gnn_tensors_metadata(data, size, "rooms", text, sizeof text))
+        *rooms = atoi(text);
     for (int k = 0; k < 2; ++k) {
         const gnn_tensor *a = gnn_tensors_find(tensors, count, k ? "held.maps" : "train.maps");
         const gnn_tensor *b = gnn_tensors_find(tensors, count, k ? "held.photons" : "train.photons");
         if (!a || !b || a->rank != 4 || a->shape[1] != sets[k].planes || a->shape[2] != PN_ROWS ||
-            a->shape[3] != PN_COLUMNS || b->rank != 2 || b->shape[0] != a->shape[0] || b->shape[1] != 3)
+            a->shape[3] != PN_COLUMNS || b->rank != 2 || b->shape[0] != a->shape[0] || b->shape[1] != 2)
             die(path, "not a data set of this program: remove it, or name another one by --data");
         size_t n = (size_t)a->shape[0];
         set *s = &sets[k];
         s->capacity = s->count + (uint32_t)n;
         s->maps = need(realloc(s->maps, ((size_t)s->capacity * s->planes * PN_AREA + 1) * sizeof(float)));
-        s->photons = need(realloc(s->photons, ((size_t)s->capacity * 3 + 1) * sizeof(float)));
-        gnn_tensor_floats(a, 0, n * s->planes * PN_AREA, set_map(s, s->count));
-        gnn_tensor_floats(b, 0, n * 3, s->photons + 3 * (size_t)s->count);
+        s->photons = need(realloc(s->photons, ((size_t)s->capacity * 2 + 1) * sizeof(float)));
+        if (!gnn_tensor_floats(a, 0, n * s->planes * PN_AREA, set_map(s, s->count)) ||
+            !gnn_tensor_floats(b, 0, n * 2, s->photons + 2 * (size_t)s->count))
+            die(path, "not of numbers that this program reads");
         s->count = s->capacity;
     }
     free(data);
     return true;
 }
 
-/* Truths with mean 1 over both halves together, so that half-floats hold them. */
-static void scale_truths(set *s)
+/* What an interrupted run has made lies in FILE.part; only all of it becomes FILE. */
+static void make_rooms(const options *o, set sets[2])
 {
-    for (uint32_t i = 0; i < s->count; ++i) {
-        float *truth = set_map(s, i) + TRUTH_A * PN_AREA;
-        for (int h = 0; h < 2; ++h, truth += PN_AREA) {
-            double sum = 0;
-            for (int k = 0; k < PN_AREA; ++k)
-                sum += (double)truth[k];
-            for (int k = 0; k < PN_AREA; ++k)
-                truth[k] = (float)(truth[k] * PN_AREA / sum);
-        }
+    const char *path = o->data_count ? o->data[0] : NULL;
+    char part[MOST_PATH] = "";
+    int done = 0, rooms = (int)o->rooms;
+    if (path) {
+        suffixed(part, path, ".part");
+        if (load_data(o, part, &done, sets))
+            printf("%s: going on after %d rooms\n", part, done);
     }
+    for (int k = done; k < rooms; ++k) {
+        run_room(o, k, &sets[k % HELD_EVERY == HELD_EVERY - 1]);
+        if (path && (k % 10 == 9 || k + 1 == rooms))
+            save_data(o, part, k + 1, sets);
+    }
+    if (path && rename(part, path))
+        die(path, strerror(errno));
 }
 
-static void make_data(const options *o, set sets[2])
+static void get_data(const options *o, set sets[2])
 {
-    for (int k = 0; k < (o->scene ? 1 : (int)o->rooms); ++k) {
-        run_room(o, k, &sets[o->scene || k % 6 == 5]);
-        scale_truths(&sets[0]);
-        scale_truths(&sets[1]);
-        if (o->data_count && (o->scene || k % 10 == 9 || k + 1 == (int)o->rooms))
-            save_data(o->data[0], sets);
+    int there = 0;
+    if (o->scene) {
+        run_room(o, 0, &sets[1]);
+        return;
     }
+    for (int k = 0; k < o->data_count; ++k)
+        there += load_data(o, o->data[k], NULL, sets);
+    if (there < o->data_count && o->data_count > 1)
+        die("--data", "not all files are there: only a single one is made");
+    if (!there)
+        make_rooms(o, sets);
 }
 
 /* ---- >>judge ------------------------------------------------------------------------------------------------ */
@@ -714,7 +770,7 @@ static void load_example(const set *s, uint32_t i, uint32_t change, float *input
         transform(maps + (size_t)(FEATURES + k) * PN_AREA, change, e.features + k * PN_AREA);
     for (int k = 0; k < PN_AREA; ++k)
         e.features[4 * PN_AREA + k] = e.features[2 * PN_AREA + k] > 0 ? 1.0f : 0.0f;
-    pn_inputs(e.repaired, e.features, s->photons[3 * (size_t)i], inputs);
+    pn_inputs(e.repaired, e.features, s->photons[2 * (size_t)i], inputs);
     if (!target)
         return;
     transform(maps + TRUTH_A * PN_AREA, change, e.truth);
@@ -728,7 +784,8 @@ enum { SHARES = 3 };
 static const double uniform_shares[SHARES] = {0.01, 0.1, 0.5};
 
 /* How good a map is to sample: second moment over squared mean of the estimator of the truth's integral by it, mixed
-   with uniform directions; 1 = perfect. The truth's halves are independent: so their noise adds nothing. And L1. */
+   with uniform directions; 1 = perfect. The truth's halves are independent, so that noise of their bins does not raise
+   its expectation. And L1, which has that noise. */
 typedef struct score {
     double v[SHARES], l1;
 } score;
@@ -805,7 +862,7 @@ static void judge_net(runner *r, const set *s, float low, float high, uint32_t s
     memset(t, 0, sizeof *t);
     *loss = 0;
     for (uint32_t i = 0; i < s->count; i += stride) {
-        if (!(s->photons[3 * (size_t)i] >= low && s->photons[3 * (size_t)i] < high))
+        if (!(s->photons[2 * (size_t)i] >= low && s->photons[2 * (size_t)i] < high))
             continue;
         load_example(s, i, 0, r->inputs, r->targets);
         gnn_unet_forward(r->net, r->inputs, 1, r->outputs, r->workspace, r->size, NULL, NULL);
@@ -820,7 +877,7 @@ static void judge_plane(const set *s, int plane, float low, float high, tally *t
 {
     memset(t, 0, sizeof *t);
     for (uint32_t i = 0; i < s->count; ++i)
-        if (s->photons[3 * (size_t)i] >= low && s->photons[3 * (size_t)i] < high)
+        if (s->photons[2 * (size_t)i] >= low && s->photons[2 * (size_t)i] < high)
             add_score(t, judge(set_map(s, i), set_map(s, i) + (size_t)plane * PN_AREA));
 }
 
@@ -829,15 +886,17 @@ static void judge_plane(const set *s, int plane, float low, float high, tally *t
 /* Where a training stands; kept in the checkpoint's metadata. */
 typedef struct state {
     uint64_t step;
-    double seconds, loss; /* CPU seconds spent; the last steps' mean loss */
+    double seconds, loss; /* CPU seconds spent; the last steps' mean loss, 0 = not known */
+    uint64_t refused;     /* maps that gnn_unet_train refused, since this program began; best 0 */
 } state;
 
 static void save_net(const gnn_unet *net, gnn_type type, const char *path, const state *s)
 {
-    char step[32], seconds[32];
-    const char *metadata[] = {"step", step, "cpu_seconds", seconds, NULL};
+    char step[32], seconds[32], loss[32];
+    const char *metadata[] = {"step", step, "cpu_seconds", seconds, "loss", loss, NULL};
     snprintf(step, sizeof step, "%llu", (unsigned long long)s->step);
     snprintf(seconds, sizeof seconds, "%.1f", s->seconds);
+    snprintf(loss, sizeof loss, "%.6f", s->loss);
     size_t size = gnn_unet_bound(net, type, metadata);
     void *data = need(malloc(size ? size : 1));
     gnn_result result = gnn_unet_save(net, type, metadata, data, size, &size);
@@ -847,23 +906,36 @@ static void save_net(const gnn_unet *net, gnn_type type, const char *path, const
     free(data);
 }
 
-/* Nothing where there is no checkpoint yet. */
-static void load_net(gnn_unet *net, const char *path, state *s)
+/* A number of the metadata, 0 where it is not there. */
+static double number_of(const char *path, const void *data, size_t size, const char *key)
+{
+    char text[32], *end;
+    if (!gnn_tensors_metadata(data, size, key, text, sizeof text))
+        return 0;
+    double value = strtod(text, &end);
+    if (end == text || *end || !(value >= 0 && value < 1e15)) {
+        fprintf(stderr, "train_histogram: %s: %s of its metadata is %s\n", path, key, text);
+        exit(1);
+    }
+    return value;
+}
+
+/* False = there is no checkpoint yet. */
+static bool load_net(gnn_unet *net, const char *path, state *s)
 {
     size_t size;
-    void *data = path ? read_file(path, &size) : NULL;
+    void *data = read_file(path, &size);
     gnn_message message = {""};
-    char text[32];
     if (!data)
-        return;
+        return false;
     gnn_result result = gnn_unet_load(net, data, size, &message);
     if (result)
         die(path, message.text[0] ? message.text : gnn_result_string(result));
-    if (gnn_tensors_metadata(data, size, "step", text, sizeof text))
-        s->step = strtoull(text, NULL, 10);
-    if (gnn_tensors_metadata(data, size, "cpu_seconds", text, sizeof text))
-        s->seconds = atof(text);
+    s->step = (uint64_t)number_of(path, data, size, "step");
+    s->seconds = number_of(path, data, size, "cpu_seconds");
+    s->loss = number_of(path, data, size, "loss");
     free(data);
+    return true;
 }
 
 /* The validation's points so far, one a line, beside the checkpoint: step, seconds, loss of training, loss and mean V
@@ -886,15 +958,17 @@ static void draw_curve(const options *o, const char *points)
 
 static void validate(const options *o, runner *r, const set *held, const state *s, double done)
 {
-    char points[1024];
+    char points[MOST_PATH];
     tally t;
     double loss, spent = done > 0 ? s->seconds / done : 0;
     judge_net(r, held, 0, 1e9f, 4, &t, &loss);
     printf("step %llu, %.0f CPU s, %.0f to go: loss %.4f, held out %.4f, V %.3f\n", (unsigned long long)s->step,
            s->seconds, spent - s->seconds, s->loss, loss, t.v[1] / (t.n ? t.n : 1));
+    if (s->refused)
+        printf("%llu maps refused: not finite, or far too large\n", (unsigned long long)s->refused);
     fflush(stdout);
     save_net(r->net, GNN_TYPE_F32, o->checkpoint, s);
-    snprintf(points, sizeof points, "%s.curve", o->checkpoint);
+    suffixed(points, o->checkpoint, ".curve");
     FILE *f = fopen(points, "a");
     if (!f || fprintf(f, "%llu %.1f %.6f %.6f %.6f\n", (unsigned long long)s->step, s->seconds, s->loss, loss,
                       t.v[1] / (t.n ? t.n : 1)) < 0)
@@ -915,9 +989,12 @@ static void train_step(const options *o, runner *r, const set *s, state *at, dou
         load_example(s, (uint32_t)((h >> 32) % s->count), (uint32_t)h & 255,
                      r->inputs + (size_t)k * PN_INPUTS * PN_AREA, r->targets + (size_t)k * PN_AREA);
     }
-    gnn_unet_train(r->net, r->inputs, r->targets, r->batch, &seen, r->workspace, r->size, r->pool ? tr_pool_run : NULL,
-                   r->pool); /* the workspace has room */
-    at->loss += (seen.loss - at->loss) * (at->step < 100 ? 1.0 / (double)(at->step + 1) : 0.01);
+    gnn_result result = gnn_unet_train(r->net, r->inputs, r->targets, r->batch, &seen, r->workspace, r->size,
+                                       r->pool ? tr_pool_run : NULL, r->pool);
+    if (result)
+        die("training", gnn_result_string(result));
+    at->refused += seen.refused;
+    at->loss += (seen.loss - at->loss) * (at->loss > 0 ? fmax(0.01, 1.0 / (double)(at->step + 1)) : 1);
     at->step++;
 }
 
@@ -926,8 +1003,10 @@ static double share_done(const options *o, const state *s)
     return o->steps ? (double)s->step / (double)o->steps : o->seconds > 0 ? s->seconds / o->seconds : 1;
 }
 
+/* Writes a checkpoint only where it has made a step. */
 static void train(const options *o, runner *r, const set sets[2], state *s)
 {
+    uint64_t begun = s->step;
     double before = s->seconds, start = tr_cpu_seconds(), shown = before;
     while (share_done(o, s) < 1) {
         train_step(o, r, &sets[0], s, share_done(o, s));
@@ -937,7 +1016,8 @@ static void train(const options *o, runner *r, const set sets[2], state *s)
             shown = s->seconds;
         }
     }
-    validate(o, r, &sets[1], s, 1);
+    if (s->step > begun)
+        validate(o, r, &sets[1], s, 1);
 }
 
 static double net_milliseconds(runner *r)
@@ -993,35 +1073,68 @@ static const char usage[] =
     "  --weights FILE       half-float weights, written at the end     --curve FILE.svg  losses over time\n"
     "  --seed N  --threads N  --batch N (16)  --rate R (0.002)  --lambda L  --deep W  --channels A,B,...\n";
 
-static void parse_channels(const char *text, uint32_t channels[GNN_MAX_LEVELS])
+/* A,B,...: one to six whole numbers of 1 .. 512. */
+static bool parse_channels(const char *text, uint32_t channels[GNN_MAX_LEVELS])
 {
     memset(channels, 0, GNN_MAX_LEVELS * sizeof *channels);
-    for (int l = 0; l < GNN_MAX_LEVELS && *text; ++l) {
+    for (int l = 0; l < GNN_MAX_LEVELS; ++l) {
         char *end;
-        channels[l] = (uint32_t)strtoul(text, &end, 10);
-        text = *end == ',' ? end + 1 : "";
+        unsigned long value = *text >= '0' && *text <= '9' ? strtoul(text, &end, 10) : 0;
+        if (value < 1 || value > 512)
+            return false;
+        channels[l] = (uint32_t)value;
+        if (!*end)
+            return true;
+        if (*end != ',')
+            return false;
+        text = end + 1;
     }
+    return false;
+}
+
+static void refuse_number(const char *key, const char *value, double low, double high, bool whole)
+{
+    fprintf(stderr, "train_histogram: %s %s: %s of %g .. %g is needed\n", key, value,
+            whole ? "a whole number" : "a number", low, high);
+    exit(1);
+}
+
+static bool set_number(options *o, const char *key, const char *value)
+{
+    const struct {
+        const char *key;
+        double *to, low, high;
+        bool whole;
+    } numbers[] = {{"--rooms", &o->rooms, 1, 1e5, true},      {"--room-seconds", &o->room_seconds, 0, 1e6, false},
+                   {"--seconds", &o->seconds, 0, 1e8, false}, {"--steps", &o->steps, 0, 1e9, true},
+                   {"--seed", &o->seed, 0, 1e9, true},        {"--threads", &o->threads, 1, 256, true},
+                   {"--batch", &o->batch, 1, 1024, true},     {"--rate", &o->rate, 0, 1, false},
+                   {"--lambda", &o->lambda, 0, 1000, false},  {"--deep", &o->deep, 0, 1000, false}};
+    for (size_t k = 0; k < sizeof numbers / sizeof *numbers; ++k)
+        if (!strcmp(key, numbers[k].key)) {
+            char *end;
+            double x = strtod(value, &end);
+            if (end == value || *end || !(x >= numbers[k].low && x <= numbers[k].high) ||
+                (numbers[k].whole && x != floor(x)))
+                refuse_number(key, value, numbers[k].low, numbers[k].high, numbers[k].whole);
+            *numbers[k].to = x;
+            return true;
+        }
+    return false;
 }
 
 static bool set_option(options *o, const char *key, const char *value)
 {
-    const struct {
-        const char *key;
-        double *to;
-    } numbers[] = {{"--rooms", &o->rooms},     {"--room-seconds", &o->room_seconds},
-                   {"--seconds", &o->seconds}, {"--steps", &o->steps},
-                   {"--seed", &o->seed},       {"--threads", &o->threads},
-                   {"--batch", &o->batch},     {"--rate", &o->rate},
-                   {"--lambda", &o->lambda},   {"--deep", &o->deep}};
-    for (size_t k = 0; k < sizeof numbers / sizeof *numbers; ++k)
-        if (!strcmp(key, numbers[k].key)) {
-            char *end;
-            *numbers[k].to = strtod(value, &end);
-            return end != value && !*end && *numbers[k].to >= 0 && *numbers[k].to < 1e9;
-        }
-    if (!strcmp(key, "--data") && o->data_count < MAX_DATA)
+    if (set_number(o, key, value))
+        return true;
+    if (!strcmp(key, "--channels")) {
+        if (!parse_channels(value, o->channels))
+            die("--channels", "one to six whole numbers of 1 .. 512 are needed, with commas between them");
+    } else if (!strcmp(key, "--data")) {
+        if (o->data_count == MAX_DATA)
+            die("--data", "so many files are not read");
         o->data[o->data_count++] = value;
-    else if (!strcmp(key, "--scene"))
+    } else if (!strcmp(key, "--scene"))
         o->scene = value;
     else if (!strcmp(key, "--checkpoint"))
         o->checkpoint = value;
@@ -1029,11 +1142,20 @@ static bool set_option(options *o, const char *key, const char *value)
         o->weights = value;
     else if (!strcmp(key, "--curve"))
         o->curve = value;
-    else if (!strcmp(key, "--channels"))
-        parse_channels(value, o->channels);
     else
         return false;
     return true;
+}
+
+static void parse_options(options *o, int argc, char **argv)
+{
+    for (int i = 1; i < argc; i += 2)
+        if (i + 1 == argc || !set_option(o, argv[i], argv[i + 1]))
+            die(argv[i], "unknown, or without its value; --help lists the options");
+    if (o->scene && o->data_count)
+        die("--scene", "is judged on maps of its own: leave out --data");
+    if (o->weights && !strcmp(o->weights, o->checkpoint))
+        die("--weights", "would be written over the checkpoint");
 }
 
 static gnn_unet *make_net(const options *o)
@@ -1063,33 +1185,27 @@ int main(int argc, char **argv)
                  .rate = 0.002,
                  .checkpoint = "histogram.checkpoint"};
     set sets[2] = {{.planes = TRAIN_PLANES}, {.planes = HELD_PLANES}};
-    state s = {0, 0, 0};
+    state s = {0, 0, 0, 0};
     runner r;
     if (argc == 2 && !strcmp(argv[1], "--help")) {
         fputs(usage, stdout);
         return 0;
     }
-    for (int i = 1; i < argc; i += 2)
-        if (i + 1 == argc || !set_option(&o, argv[i], argv[i + 1])) {
-            fprintf(stderr, "train_histogram: %s: unknown, or without a value that it can have\n%s", argv[i], usage);
-            return 2;
-        }
-    bool there = o.data_count > 0;
-    for (int k = 0; k < o.data_count && there; ++k)
-        there = load_data(o.data[k], sets);
-    if (!there && o.data_count > 1)
-        die("--data", "not all files are there: only a single one is made");
-    if (!there)
-        make_data(&o, sets);
+    parse_options(&o, argc, argv);
+    get_data(&o, sets);
     printf("%u maps to train, %u held out\n", sets[0].count, sets[1].count);
     if ((!sets[0].count && !o.scene) || !sets[1].count)
-        die("data", "too few rooms had enough light: make more by --rooms or --room-seconds");
+        die("data", "too few rooms had enough light: make other data, with more --rooms or --room-seconds");
     start_runner(&r, make_net(&o), (uint32_t)o.batch, (int)o.threads);
-    load_net(r.net, o.checkpoint, &s);
-    if (sets[0].count)
+    bool there = load_net(r.net, o.checkpoint, &s);
+    if (there)
+        printf("%s: step %llu, %.0f CPU s\n", o.checkpoint, (unsigned long long)s.step, s.seconds);
+    else
+        printf("%s is not there: %s\n", o.checkpoint, o.scene ? "no network is judged" : "begun anew");
+    if (!o.scene)
         train(&o, &r, sets, &s);
-    report(&r, &sets[1], s.step > 0);
-    if (o.weights && s.step > 0)
+    report(&r, &sets[1], there || s.step > 0);
+    if (o.weights && (there || s.step > 0))
         save_net(r.net, GNN_TYPE_F16, o.weights, &s);
     return 0;
 }
