@@ -59,8 +59,9 @@
 
      What is learned is the histogram after desc.repair, the classical filters of Table 1 that need no network, or the
      map that gph_import_maps wrote in its place. The Gaussian's width is chosen for each map by what its photons say of
-     each other. Filters know that phi wraps and that the way over a pole goes on at phi + pi. A map is made anew when a
-     third of its voxel's photons are new to it, that of a closed voxel (see Gate) not before it is tried again.
+     each other, anew when they have doubled or its voxel was split. Filters know that phi wraps and that the way over a
+   pole goes on at phi + pi. A map is made anew when a third of its voxel's photons are new to it, that of a closed
+   voxel (see Gate) not before it is tried again.
 
      Splits: a voxel that has seen more photons than split_photons sqrt(N / N_0) is halved, at most 3 levels a refine;
      N = photons so far, N_0 = of the first pass. (The paper has sqrt(2^t) in pass t, which is the same where passes
@@ -100,11 +101,11 @@
      half-floats), 8 per node, 24 to 48 per cube. Building part: 360 bytes per voxel; its histogram is nothing while
      empty, a list of 16 bytes per lit bin below 256 photons, 12 n bytes above. The first pass's photons wait in 24
      bytes each, at most desc.cloud_photons. refine makes a new sampling part beside the old one, whose memory is kept
-     for the next, from the second on with up to a quarter to spare: as far as all this together stays within 8 times
-   the half-floats of all maps, which it does not where most histograms are dense. max_bytes bounds all of this
-     together: beyond it cubes, histograms and splits are denied and counted. Allocation happens in create,
-     stream_create, record, accumulate, refine, load; never in a query, and always from the calling thread. Stack: below
-     140 KB per call of refine and gph_import_maps, 8 KB for others.
+     for the next, from the second on with up to a quarter to spare: as far as all this together stays, between
+     refines, within 8 times the half-floats of all maps, which it does not where most histograms are dense. max_bytes
+     bounds all of this together: beyond it cubes, histograms and splits are denied and counted. Allocation happens in
+     create, stream_create, record, accumulate, refine, load; never in a query, and always from the calling thread.
+     Stack: below 140 KB per call of refine and gph_import_maps, 8 KB for others.
 
    THREADS: each function has a tag.
      [any thread]   pure function on constant data
@@ -358,8 +359,8 @@ GPH_API gph_result gph_refine(gph_field *field, gph_parallel_fn parallel, void *
 GPH_API bool gph_all_closed(const gph_field *field);
 /* True where a photon at this position would be kept in this pass; to end photon paths early. [any thread] */
 GPH_API bool gph_takes_photons(const gph_field *field, const float position[3]);
-/* How many photons the voxel at this position has seen by the last accumulate; negative where it takes none. What
-   another one would be worth there, to decide where to send them. [any thread] */
+/* How many photons the voxel at this position has seen by the last accumulate, in the first pass 0 until its refine;
+   negative where it takes none. What another one would be worth there, to decide where to send them. [any thread] */
 GPH_API double gph_photons_at(const gph_field *field, const float position[3]);
 
 GPH_API void gph_get_stats(const gph_field *field, gph_stats *stats); /* [any thread] */
@@ -1985,13 +1986,13 @@ static gph_result gphi_close_cloud(gphi_batch *b, gph_parallel_fn parallel, void
 
 /* ---- >>gate ------------------------------------------------------------------------------------------------- */
 
-/* held = fade held + now. */
-static void gphi_fold(gphi_state *s, double fade)
+/* held = held / 2 + now. */
+static void gphi_fold(gphi_state *s)
 {
     double *held = (double *)(void *)&s->held, *now = (double *)(void *)&s->now;
     uint32_t k;
     for (k = 0; k < sizeof(gphi_sums) / sizeof(double); ++k)
-        held[k] = fmin(fade * held[k] + now[k], 1e150);
+        held[k] = fmin(0.5 * held[k] + now[k], 1e150);
     memset(&s->now, 0, sizeof s->now);
 }
 
@@ -2068,12 +2069,12 @@ static void gphi_verdict(const gph_desc *desc, gphi_state *s, gph_stats *stats)
     }
 }
 
-/* Fold the sums after a pass. Without a map nothing was guided: eq. 14 has nothing to compare, V neither. What surfaces
-   reflect is the same under any guide. */
+/* Fold the sums after a pass. Without a map V has seen nothing; what the BSDF drew and what surfaces reflect is the
+   same under any guide. */
 static void gphi_fold_pass(gphi_state *s)
 {
     double seen;
-    gphi_fold(s, s->map == GPH_NONE ? 0 : 0.5);
+    gphi_fold(s);
     seen = s->held.q_bsdf + s->held.q_guide;
     if (seen >= GPHI_MIN_SEEN)
         s->reflected = (float)fmin(s->held.flow / seen, 1e30); /* a loaded sum may be larger */
@@ -2357,7 +2358,8 @@ static float gphi_blur(float *a, float *b, int rows, int columns, double sigma)
 
 /* How likely a blur makes each photon given all others: sum over bins of flux times log of (1 - e) (b - k^2 w) /
    (sum - w) + e / bins, b the blurred histogram, k the kernel's middle, w the mean flux of the bin's photons.
-   Leave-one-out cross-validation, own. map: the histogram, whose sum is `sum`; its second half and scratch are lost. */
+   Leave-one-out cross-validation, own. map: the histogram, whose sum is `sum`; its second half and the first half of
+   scratch are lost. */
 static double gphi_likelihood(const gph_field *f, const gphi_voxel *v, float *map, float *scratch, double sum,
                               double sigma)
 {

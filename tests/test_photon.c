@@ -792,8 +792,11 @@ static void test_only_places_of_camera_paths_take_photons(void **state)
     OK(gph_create(&d, &f));
     learn(f, NULL, 0, q, 2); /* before any camera path: nobody reads them */
     assert_int_equal(stats_of(f).unread, 2);
+    assert_true(gph_photons_at(f, here) < 0 && gph_photons_at(f, there) < 0);
     learn(f, &v, 1, q, 2);
+    assert_true(gph_photons_at(f, here) == 0 && gph_photons_at(f, there) < 0); /* they wait for the refine */
     OK(gph_refine(f, NULL, NULL));
+    assert_true(gph_photons_at(f, here) == 1 && gph_photons_at(f, there) < 0);
     gph_stats s = stats_of(f);
     assert_int_equal(s.photons, 1);
     assert_int_equal(s.unread, 3);
@@ -801,6 +804,8 @@ static void test_only_places_of_camera_paths_take_photons(void **state)
     assert_int_equal(s.maps, 1);
     assert_int_equal(s.sparse, 1);
     assert_true(gph_takes_photons(f, here) && !gph_takes_photons(f, there));
+    learn(f, NULL, 0, q, 1);
+    assert_true(gph_photons_at(f, here) == 2); /* later passes count at once */
     gph_destroy(f);
 }
 
@@ -915,6 +920,7 @@ static void test_later_passes_are_cut_in_the_middle_and_halves_inherit(void **st
     OK(gph_refine(f, NULL, NULL));
     assert_int_equal(stats_of(f).splits, 0);
     learn(f, &v, 1, q, N); /* 1800 > 1000 sqrt(1800 / 900) */
+    assert_true(gph_photons_at(f, p) == 2 * N && gph_photons_at(f, other) == 2 * N);
     gph_handle before = find(f, p);
     float density = gph_pdf(&before, w);
     OK(gph_refine(f, NULL, NULL));
@@ -926,8 +932,10 @@ static void test_later_passes_are_cut_in_the_middle_and_halves_inherit(void **st
     assert_true(low.voxel != high.voxel);
     assert_true(gph_pdf(&low, w) == density && gph_pdf(&high, w) == density);
     assert_false(gph_takes_photons(f, p)); /* until it is touched again */
+    assert_true(gph_photons_at(f, p) < 0 && gph_photons_at(f, other) < 0);
     learn(f, &v, 1, NULL, 0);
     assert_true(gph_takes_photons(f, p) && !gph_takes_photons(f, other));
+    assert_true(gph_photons_at(f, p) == N && gph_photons_at(f, other) < 0); /* half of them */
     gph_destroy(f);
 }
 
@@ -1323,6 +1331,13 @@ static void test_truncated_flipped_and_forged_saves_never_harm(void **state)
         q[1 + bit / 8] ^= (unsigned char)(1u << (bit % 8));
         assert_true(gph_load(NULL, q + 1, size, &g) != GPH_OK && g == NULL);
     }
+    for (uint32_t version = 0; version < 4; ++version) { /* its checksum holds: only its number tells of what it is */
+        memcpy(q, p, size);
+        memcpy(q + offsetof(gphi_header, version), &version, sizeof version);
+        assert_int_equal(gph_load(NULL, q, size, &g), version == GPH_VERSION ? GPH_OK : GPH_BAD_VERSION);
+        assert_true((g != NULL) == (version == GPH_VERSION));
+        gph_destroy(g);
+    }
     int loaded = 0, refused = 0;
     for (int i = 0; i < 3000; ++i) {
         size_t at = i < 1500 ? rng_next() % 1500 : rng_next() % size;
@@ -1664,18 +1679,22 @@ static void test_gate_closes_where_guiding_does_not_pay_and_opens_where_it_does(
 }
 
 /* Contribution / p is 2 g where p is a half, 0.5 g where it is two: its mean is known. With and without a map; too few
-   vertices say nothing, and passes without any forget nothing. */
+   vertices say nothing, also those of several passes together, and passes without any forget nothing. */
 static void test_handles_tell_what_surfaces_reflect(void **state)
 {
     (void)state;
     gph_desc d = unit_cube();
     gph_field *f;
-    float p[3] = {0.1f, 0.1f, 0.1f}, far[3] = {0.9f, 0.1f, 0.1f};
+    float p[3] = {0.1f, 0.1f, 0.1f}, far[3] = {0.9f, 0.1f, 0.1f}, rare[3] = {0.1f, 0.9f, 0.1f};
     gph_stream *s;
     OK(gph_create(&d, &f));
     OK(gph_stream_create(f, &s));
     for (int pass = 0; pass < 5; ++pass) {
-        for (int i = 0; i < (pass == 0 ? 30 : pass < 4 ? 40 : 0); ++i) {
+        for (int i = 0; i < 20; ++i) {
+            gph_vertex v = gph_make_vertex(rare, (float)(i % 2 ? 4 : 3), i % 4 < 2 ? 0.5f : 2, 1, 0, GPH_FROM_BSDF);
+            OK(gph_record_vertices(s, &v, 1));
+        }
+        for (int i = 0; i < (pass == 0 ? 28 : pass < 4 ? 40 : 0); ++i) {
             gph_vertex v = gph_make_vertex(p, (float)(i % 2 ? 4 : 3), i % 4 < 2 ? 0.5f : 2, 1, 0, GPH_FROM_BSDF);
             OK(gph_record_vertices(s, &v, 1));
             v = touch(p);
@@ -1693,6 +1712,9 @@ static void test_handles_tell_what_surfaces_reflect(void **state)
         assert_float_equal(h.reflected, pass ? 3.5 * 1.25 : 0, 1e-5);
         assert_true((h.weights != NULL) == (pass >= 2));
         assert_float_equal(find(f, far).reflected, 0, 0); /* nobody has looked on from there */
+        gph_handle seldom = find(f, rare);                /* 20, 30, 30 / 4 + 20, 33.75 vertices: now they are enough */
+        assert_true(seldom.weights == NULL);
+        assert_float_equal(seldom.reflected, pass < 3 ? 0 : 3.5 * 1.25, 1e-5);
     }
     gph_stream_destroy(s);
     gph_destroy(f);

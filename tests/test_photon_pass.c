@@ -1049,21 +1049,21 @@ static void random_numbers(tr_rng *rng, float u[5])
 /* Passes of an emission map that learns from of_use; more samples than it keeps. */
 static tr_emission_map *learned_map(int tiles)
 {
-    tr_emission_map *map = tr_emission_create(tiles);
+    tr_emission_map *map = tr_emission_map_create(tiles);
     tr_rng rng = rng_seed(5, 5);
     assert_non_null(map);
-    assert_true(tr_emission_gain(map) == 1);
+    assert_true(tr_emission_map_gain(map) == 1);
     for (int pass = 0; pass < 6; ++pass) {
         enum { N = 50000 };
         for (int i = 0; i < N; ++i) {
             float u[5], density;
             random_numbers(&rng, u);
-            density = tr_emission_warp(map, u);
+            density = tr_emission_map_warp(map, u);
             if (of_use(u, &rng))
-                assert_true(tr_emission_record(map, i * tiles / N, u, density, 1));
+                assert_true(tr_emission_map_record(map, i * tiles / N, u, density, 1));
         }
-        tr_emission_flush(map);
-        tr_emission_learn(map);
+        tr_emission_map_flush(map);
+        tr_emission_map_learn(map);
     }
     return map;
 }
@@ -1076,14 +1076,14 @@ static void emission_map_is_a_density(void **state)
     tr_rng rng = rng_seed(6, 6);
     double volume[5][4] = {{0}}, squares[5][4] = {{0}}, inside = 0;
     enum { N = 200000 };
-    assert_true(tr_emission_gain(map) > 1.4);
+    assert_true(tr_emission_map_gain(map) > 1.4);
     for (int i = 0; i < N; ++i) {
         float u[5], v[5], density;
         random_numbers(&rng, u);
         memcpy(v, u, sizeof v);
-        density = tr_emission_warp(map, u);
+        density = tr_emission_map_warp(map, u);
         assert_true(density >= 0.2499f && density < 100);
-        assert_true(tr_emission_warp(other, v) == density); /* streams in one order: tiles do not matter */
+        assert_true(tr_emission_map_warp(other, v) == density); /* streams in one order: tiles do not matter */
         assert_memory_equal(u, v, sizeof u);
         for (int k = 0; k < 5; ++k) {
             assert_true(u[k] >= 0 && u[k] < 1);
@@ -1101,32 +1101,67 @@ static void emission_map_is_a_density(void **state)
     /* The best density is as the root of how many are of use; a quarter stays even. */
     double box = 1.0 / 32, rest = sqrt(0.02) * 31 / 32, best = 0.75 * box / (box + rest) + 0.25 / 32;
     assert_true(fabs(inside / N - best) < 0.1 * best);
-    tr_emission_destroy(map);
-    tr_emission_destroy(other);
-    tr_emission_destroy(NULL);
+    tr_emission_map_destroy(map);
+    tr_emission_map_destroy(other);
+    tr_emission_map_destroy(NULL);
+}
+
+/* Much is of use all over, so few of the paths are kept; then only in a corner, and not often: the old ones go, more of
+   the new ones are kept, and soon all start there. */
+static void emission_map_forgets(void **state)
+{
+    (void)state;
+    tr_emission_map *map = tr_emission_map_create(1);
+    tr_rng rng = rng_seed(8, 8);
+    int corner = 0;
+    uint64_t bytes[2] = {0, 0};
+    assert_non_null(map);
+    for (int pass = 0; pass < 60; ++pass) {
+        int n = pass < 3 ? 300000 : 12;
+        for (int i = 0; i < n; ++i) {
+            float u[5];
+            random_numbers(&rng, u);
+            if (pass >= 3)
+                u[2] *= 0.0625f, u[3] *= 0.0625f;
+            assert_true(tr_emission_map_record(map, 0, u, pass < 3 ? 1 : 256, 1));
+        }
+        bytes[pass > 0] = tr_emission_map_bytes(map);
+        tr_emission_map_flush(map);
+        tr_emission_map_learn(map);
+    }
+    assert_true(bytes[0] > 300000 * 32 && bytes[1] == bytes[0]); /* later lists are shorter, and none is given back */
+    for (int i = 0; i < 1000; ++i) {
+        float u[5];
+        random_numbers(&rng, u);
+        tr_emission_map_warp(map, u);
+        corner += u[2] < 0.0625f && u[3] < 0.0625f;
+    }
+    print_message("%d of 1000 in the corner, gain %.0f\n", corner, tr_emission_map_gain(map));
+    assert_true(corner > 650); /* 750, less what the boxes are too wide */
+    tr_emission_map_destroy(map);
 }
 
 /* Nothing is gained: the numbers stay as they are. */
 static void even_use_leaves_emission_even(void **state)
 {
     (void)state;
-    tr_emission_map *map = tr_emission_create(1);
+    tr_emission_map *map = tr_emission_map_create(1);
     tr_rng rng = rng_seed(7, 7);
     for (int pass = 0; pass < 4; ++pass) {
         for (int i = 0; i < 20000; ++i) {
             float u[5], v[5];
             random_numbers(&rng, u);
             memcpy(v, u, sizeof v);
-            assert_true(tr_emission_warp(map, u) == 1);
+            assert_true(tr_emission_map_warp(map, u) == 1);
             assert_memory_equal(u, v, sizeof u);
             for (int hit = 0; hit < (i % 1000 ? 2 : 50); ++hit) /* a path that comes often is still one */
-                assert_true(tr_emission_record(map, 0, u, 1, i % 1000 ? 1 : 0.04f));
+                assert_true(tr_emission_map_record(map, 0, u, 1, i % 1000 ? 1 : 0.04f));
         }
-        tr_emission_flush(map);
-        tr_emission_learn(map);
+        tr_emission_map_flush(map);
+        tr_emission_map_learn(map);
     }
-    assert_true(tr_emission_gain(map) == 1);
-    tr_emission_destroy(map);
+    assert_true(tr_emission_map_gain(map) == 1);
+    tr_emission_map_destroy(map);
 }
 
 typedef struct learner {
@@ -1139,7 +1174,7 @@ static bool record_inside(void *user, int tile, const tr_photon *photons, int n)
     learner *l = user;
     for (int i = 0; i < n; ++i)
         if (fabsf(photons[i].p.y) < 1e-4f && fabsf(photons[i].p.x) < l->half && fabsf(photons[i].p.z) < l->half)
-            assert_true(tr_emission_record(l->map, tile, photons[i].u, photons[i].density, 1));
+            assert_true(tr_emission_map_record(l->map, tile, photons[i].u, photons[i].density, 1));
     return true;
 }
 
@@ -1149,7 +1184,7 @@ static void guided_emission_keeps_the_flux(void **state)
 {
     (void)state;
     tr_scene *s = scene_new();
-    learner l = {tr_emission_create(tr_photon_tiles(1 << 15)), 0.2f};
+    learner l = {tr_emission_map_create(tr_photon_tiles(1 << 15)), 0.2f};
     add_floor(s, 4);
     add_sphere(s, GRAY, v3(0.6f, 0.4f, 0), 0.3f);
     tr_shape *lamp = add_rectangle(s, GRAY, v3(1, 3, 0), 90, 0.5f, 0.5f);
@@ -1166,10 +1201,10 @@ static void guided_emission_keeps_the_flux(void **state)
         pass.index = k;
         pass.seed = 99;
         assert_true(tr_trace_photons(&pass, record_inside, &l, NULL));
-        tr_emission_flush(l.map);
-        tr_emission_learn(l.map);
+        tr_emission_map_flush(l.map);
+        tr_emission_map_learn(l.map);
     }
-    assert_true(tr_emission_gain(l.map) > 5);
+    assert_true(tr_emission_map_gain(l.map) > 5);
     receiver r[2] = {{.half = 0.2}, {.half = 4}};
     for (int k = 0; k < 2; ++k) {
         the_emission = NULL;
@@ -1181,7 +1216,7 @@ static void guided_emission_keeps_the_flux(void **state)
             assert_true(guided.sigma[c] < 0.7 * even.sigma[c]);
     }
     the_emission = NULL;
-    tr_emission_destroy(l.map);
+    tr_emission_map_destroy(l.map);
     tr_scene_free(s);
 }
 
@@ -1457,8 +1492,25 @@ static void the_picture_holds_the_flux(void **state)
     tr_scene_free(s);
 }
 
-/* The sun does not come into a closed room: after two passes photons are few and rare, and the picture is that of a
-   method that had none. */
+/* Whole pictures agree within 4 sigma, channel by channel. */
+static void same_picture(const char *what, const tr_result *a, const tr_result *b)
+{
+    size_t pixels = (size_t)a->color.width * (size_t)a->color.height;
+    for (size_t c = 0; c < 3; ++c) {
+        double sum = 0, difference = 0, variance = 0;
+        for (size_t i = c; i < 3 * pixels; i += 3) {
+            sum += (double)b->color.data[i];
+            difference += (double)a->color.data[i] - (double)b->color.data[i];
+            variance += (double)a->variance.data[i] + (double)b->variance.data[i];
+        }
+        print_message("%-28s sigma %.2f %%, z %.2f\n", what, 100 * sqrt(variance) / sum, difference / sqrt(variance));
+        assert_true(variance > 0 && sqrt(variance) < 0.03 * sum); /* else nothing would be told apart */
+        assert_true(fabs(difference) < 4 * sqrt(variance));
+    }
+}
+
+/* The sun does not come into a closed room: after two passes photons are few and rare, and the picture is that of
+   photons in every pass and of a method without any. */
 static void photons_of_no_use_are_given_up(void **state)
 {
     (void)state;
@@ -1470,23 +1522,25 @@ static void photons_of_no_use_are_given_up(void **state)
     scene_done(s);
     s->camera.to_world = mat4_translate(v3(0, 1, -0.9f));
     s->camera.fov = 60;
-    uint64_t paths[2];
-    for (int k = 0; k < 2; ++k) {
+    tr_result result[3]; /* budget off, budget on, no photons */
+    for (int k = 0; k < 3; ++k) {
         tr_option option = {.key = "budget", .value = k ? "on" : "off"};
         tr_settings settings = {.width = 16, .height = 16, .spp = 64, .threads = 1, .options = &option};
         settings.max_depth = 5;
-        tr_result result;
+        settings.seed = (uint64_t)k;
         char err[256] = "";
-        settings.option_count = 1;
-        settings.method = tr_method_find("photon");
-        assert_true(tr_render(s, &settings, &result, err, sizeof err));
-        paths[k] = result.photon_paths;
-        const char *skipped = strstr(result.method.json, "\"skipped_photon_passes\": ");
-        assert_non_null(skipped);
-        assert_true(k ? atoi(skipped + 25) >= 3 : atoi(skipped + 25) == 0);
-        tr_result_free(&result);
+        settings.option_count = k < 2;
+        settings.method = tr_method_find(k < 2 ? "photon" : "pt");
+        assert_true(tr_render(s, &settings, &result[k], err, sizeof err));
+        const char *skipped = strstr(result[k].method.json, "\"skipped_photon_passes\": ");
+        assert_true((skipped != NULL) == (k < 2));
+        assert_true(k == 2 || (k ? atoi(skipped + 25) >= 3 : atoi(skipped + 25) == 0));
     }
-    assert_true(paths[0] > 8 * paths[1]);
+    assert_true(result[0].photon_paths > 8 * result[1].photon_paths);
+    same_picture("few photons, none", &result[1], &result[2]);
+    same_picture("few photons, many", &result[1], &result[0]);
+    for (int k = 0; k < 3; ++k)
+        tr_result_free(&result[k]);
     tr_scene_free(s);
 }
 
@@ -1631,6 +1685,7 @@ int main(void)
         cmocka_unit_test(distances_to_the_sky_are_infinite),
         cmocka_unit_test(photons_are_identical_for_any_threads),
         cmocka_unit_test(emission_map_is_a_density),
+        cmocka_unit_test(emission_map_forgets),
         cmocka_unit_test(even_use_leaves_emission_even),
         cmocka_unit_test(guided_emission_keeps_the_flux),
         cmocka_unit_test(adjoint_is_the_way_back),

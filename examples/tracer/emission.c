@@ -25,12 +25,15 @@
 #define MAX_CUTS 8    /* of one axis */
 #define MIN_GAIN 1.25 /* variance with even paths over that with guided ones, that guiding is to promise */
 #define FADE 0.7f     /* of a pass's samples in the next one: by then more is known where they came */
+#define MAX_AGE 13u   /* passes: FADE^13 is 1 %, such samples go */
 #define BOXES 8192u
 #define BELOW_ONE 0x1.fffffep-1f
 
 typedef struct sample {
     float u[AXES], weight; /* weight: 1 / density */
     float need;            /* sum of 1 / M over its photons, faded */
+    uint16_t age;          /* passes */
+    uint16_t halvings;     /* it stands for 2^halvings paths */
 } sample;
 
 /* A box; its halves are children and children + 1, unless it is a leaf. */
@@ -57,7 +60,7 @@ struct tr_emission_map {
     double gain;
 };
 
-tr_emission_map *tr_emission_create(int tiles)
+tr_emission_map *tr_emission_map_create(int tiles)
 {
     tr_emission_map *e = calloc(1, sizeof *e);
     if (!e)
@@ -69,11 +72,11 @@ tr_emission_map *tr_emission_create(int tiles)
     e->gain = 1;
     if (e->tiles && e->kept && e->boxes)
         return e;
-    tr_emission_destroy(e);
+    tr_emission_map_destroy(e);
     return NULL;
 }
 
-void tr_emission_destroy(tr_emission_map *e)
+void tr_emission_map_destroy(tr_emission_map *e)
 {
     if (!e)
         return;
@@ -85,13 +88,32 @@ void tr_emission_destroy(tr_emission_map *e)
     free(e);
 }
 
-double tr_emission_gain(const tr_emission_map *e) { return e->guides ? e->gain : 1; }
+double tr_emission_map_gain(const tr_emission_map *e) { return e->guides ? e->gain : 1; }
+
+uint64_t tr_emission_map_bytes(const tr_emission_map *e)
+{
+    uint64_t samples = KEPT;
+    for (int i = 0; i < e->tile_count; ++i)
+        samples += e->tiles[i].capacity;
+    return sizeof *e + (uint64_t)e->tile_count * sizeof *e->tiles + samples * sizeof(sample) + BOXES * sizeof *e->boxes;
+}
 
 /* ---- >>samples ---------------------------------------------------------------------------------------------- */
 
-bool tr_emission_record(tr_emission_map *e, int tile, const float u[5], float density, float need)
+/* Whether a path is one of every 2^halvings that are kept. */
+static bool keeps(const tr_emission_map *e, const float u[AXES])
+{
+    uint32_t bits[4];
+    memcpy(bits, u + 1, sizeof bits);
+    uint64_t h = tr_hash64((uint64_t)bits[0] << 32 | bits[1]) ^ ((uint64_t)bits[2] << 32 | bits[3]);
+    return (tr_hash64(h) & ((UINT64_C(1) << e->halvings) - 1)) == 0;
+}
+
+bool tr_emission_map_record(tr_emission_map *e, int tile, const float u[5], float density, float need)
 {
     tile_list *t = &e->tiles[tile];
+    if (!keeps(e, u))
+        return true;
     if (t->count == t->capacity) {
         uint32_t larger = t->capacity ? 2 * t->capacity : 256;
         sample *grown = realloc(t->samples, larger * sizeof *grown);
@@ -100,9 +122,11 @@ bool tr_emission_record(tr_emission_map *e, int tile, const float u[5], float de
         t->samples = grown;
         t->capacity = larger;
     }
-    memcpy(t->samples[t->count].u, u, sizeof t->samples->u);
-    t->samples[t->count].weight = 1 / density;
-    t->samples[t->count++].need = need;
+    sample *s = &t->samples[t->count++];
+    memset(s, 0, sizeof *s);
+    memcpy(s->u, u, sizeof s->u);
+    s->weight = 1 / density;
+    s->need = need;
     return true;
 }
 
@@ -126,15 +150,6 @@ static void join_paths(tr_emission_map *e)
     e->count = n;
 }
 
-/* Whether a path is one of every 2^halvings that are kept. */
-static bool keeps(const tr_emission_map *e, const float u[AXES])
-{
-    uint32_t bits[4];
-    memcpy(bits, u + 1, sizeof bits);
-    uint64_t h = tr_hash64((uint64_t)bits[0] << 32 | bits[1]) ^ ((uint64_t)bits[2] << 32 | bits[3]);
-    return (tr_hash64(h) & ((UINT64_C(1) << e->halvings) - 1)) == 0;
-}
-
 /* Half of the paths go, unless joining makes as much room. */
 static void make_room(tr_emission_map *e)
 {
@@ -144,23 +159,44 @@ static void make_room(tr_emission_map *e)
         return;
     e->halvings++;
     for (uint32_t i = 0; i < e->count; ++i)
-        if (keeps(e, e->kept[i].u))
-            e->kept[n++] = e->kept[i];
+        if (keeps(e, e->kept[i].u)) {
+            e->kept[n] = e->kept[i];
+            if (e->kept[n].halvings < e->halvings) /* else it is from when fewer were kept */
+                e->kept[n].halvings = (uint16_t)e->halvings;
+            n++;
+        }
     e->count = n;
 }
 
-void tr_emission_flush(tr_emission_map *e)
+void tr_emission_map_flush(tr_emission_map *e)
 {
     for (int t = 0; t < e->tile_count; ++t) {
         for (uint32_t i = 0; i < e->tiles[t].count; ++i) {
-            if (!keeps(e, e->tiles[t].samples[i].u))
-                continue;
+            const sample *s = &e->tiles[t].samples[i];
             if (e->count == KEPT)
                 make_room(e);
-            e->kept[e->count++] = e->tiles[t].samples[i];
+            if (e->count == KEPT || !keeps(e, s->u)) /* more halvings than when it was recorded */
+                continue;
+            e->kept[e->count] = *s;
+            e->kept[e->count++].halvings = (uint16_t)e->halvings;
         }
         e->tiles[t].count = 0;
     }
+}
+
+/* A pass later: what is known by now fades, the oldest samples go, and where that leaves room more of the next paths
+   are kept. */
+static void grow_old(tr_emission_map *e)
+{
+    uint32_t n = 0;
+    for (uint32_t i = 0; i < e->count; ++i) {
+        sample s = e->kept[i];
+        s.need *= FADE;
+        if (++s.age < MAX_AGE)
+            e->kept[n++] = s;
+    }
+    e->count = n;
+    e->halvings -= e->halvings && n < KEPT / 4;
 }
 
 /* ---- >>build ------------------------------------------------------------------------------------------------ */
@@ -173,7 +209,7 @@ typedef struct part {
 } part;
 
 /* What a path adds to the second moment, as an even one would. */
-static double square(const sample *s) { return (double)s->weight * s->need * s->need; }
+static double square(const sample *s) { return ldexp((double)s->weight * s->need * s->need, s->halvings); }
 
 /* The axis on which the samples are least even, by quarters; AXES = even on all, or too few. */
 static int uneven_axis(const part *p, const sample *s, uint32_t n)
@@ -260,12 +296,11 @@ static void mix(tr_emission_map *e, uint32_t at, double mass, double volume, dou
     mix(e, b->children + 1u, above, 0.5 * volume, total, variance);
 }
 
-void tr_emission_learn(tr_emission_map *e)
+static void build_boxes(tr_emission_map *e)
 {
     part p = {.volume = 1};
     double variance[2] = {0, 0};
     e->guides = false;
-    join_paths(e);
     if (e->count < MIN_SAMPLES)
         return;
     e->box_count = 1;
@@ -275,13 +310,18 @@ void tr_emission_learn(tr_emission_map *e)
     mix(e, 0, mass, 1, mass, variance);
     e->gain = variance[0] / variance[1];
     e->guides = e->box_count > 1 && e->gain > MIN_GAIN;
-    for (uint32_t i = 0; i < e->count; ++i)
-        e->kept[i].need *= FADE;
+}
+
+void tr_emission_map_learn(tr_emission_map *e)
+{
+    join_paths(e);
+    build_boxes(e);
+    grow_old(e);
 }
 
 /* ---- >>warp ------------------------------------------------------------------------------------------------- */
 
-float tr_emission_warp(const tr_emission_map *e, float u[5])
+float tr_emission_map_warp(const tr_emission_map *e, float u[5])
 {
     const box *b = e ? e->boxes : NULL;
     float low[AXES] = {0}, width[AXES] = {1, 1, 1, 1, 1};

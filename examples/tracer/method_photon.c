@@ -19,6 +19,7 @@
 
 #define IDLE_PASSES 4     /* between two passes with photons where they are of no use */
 #define WORK_SHARE 0.75   /* photons' part of the work, as camera paths' part is 1 */
+#define FIRST_WORK 4      /* of a photon path, before there was any */
 #define MIN_YIELD 0.001   /* photons that valid voxels take, per path: below it they are of no use ... */
 #define PATIENCE 2        /* ... after so many passes */
 #define FEW_PHOTONS 32    /* in a voxel: the first ones say less than each is worth by 1 / M */
@@ -26,7 +27,8 @@
 
 /* What the last pass's photons cost and were good for; see >>budget. */
 typedef struct photon_budget {
-    double rate;              /* photon paths per camera path in the next pass */
+    double rate;              /* photon paths per camera path in the last pass with photons */
+    double each;              /* work of a photon path in the last pass that had some */
     uint64_t *handed;         /* photons handed over, by tile, in this pass */
     uint64_t vertices, taken; /* that the field had counted before this pass */
     uint32_t poor;            /* passes one after the other whose photons were of no use */
@@ -59,8 +61,7 @@ static bool parse(parser *p, gph_desc *d, photon *m)
     if (m->per_path > 16)
         complain(p, "photons", option(p->env, "photons"), "0 .. 16");
     m->adapts = choice(p, "budget", "off|on") != 0;
-    if (choice(p, "emission", "off|on") != 0)
-        m->emission = tr_emission_create(m->photon_tiles);
+    bool learns_emission = choice(p, "emission", "off|on") != 0;
     d->repair = (gph_repair)(choice(p, "repair", "none|gaussian|pyramid|pull_push") + 1);
     d->sigma = (float)number(p, "sigma", 0);
     d->pyramid_levels = whole(p, "pyramid_levels", 0);
@@ -79,6 +80,10 @@ static bool parse(parser *p, gph_desc *d, photon *m)
     d->gate_probe = whole(p, "gate_probe", 0);
     m->surface = choice(p, "surface", "off|on") != 0;
     m->jitter = choice(p, "jitter", "off|on") == 1;
+    if (p->ok && learns_emission && !(m->emission = tr_emission_map_create(m->photon_tiles))) {
+        snprintf(p->err, p->err_size, "photon: out of memory");
+        return false;
+    }
     return p->ok;
 }
 
@@ -109,7 +114,7 @@ static void photon_destroy(void *method)
     free(m->streams);
     photon_net_destroy(m->net);
     gph_destroy(m->field);
-    tr_emission_destroy(m->emission);
+    tr_emission_map_destroy(m->emission);
     free(m->budget.handed);
     free(m);
 }
@@ -146,9 +151,13 @@ static void *photon_create(tr_method_env *env, char *err, size_t err_size)
         return NULL;
     }
     m->view = gph_get_view(m->field);
-    m->budget.rate = m->per_path;
+    m->budget.each = FIRST_WORK;
     m->budget.handed = calloc((size_t)m->photon_tiles, sizeof *m->budget.handed);
-    return m->budget.handed ? m : (photon_destroy(m), NULL);
+    if (m->budget.handed)
+        return m;
+    snprintf(err, err_size, "photon: out of memory");
+    photon_destroy(m);
+    return NULL;
 }
 
 /* ---- passes */
@@ -162,7 +171,9 @@ static bool photon_begin_pass(void *method, const tr_pass *pass)
 /* ---- >>budget
 
    Work is counted, not timed, so that pictures do not depend on the machine: a path and each of its vertices count one.
-   Photons get WORK_SHARE of what the pass's camera paths took, at most `photons` paths for each of those. Where valid
+   Photons get WORK_SHARE of what the pass's camera paths took, at most `photons` paths for each of those. That work is
+   known by then; what a photon path takes is that of the last pass with photons, in the first one FIRST_WORK: so the
+   share is exact as far as passes are alike, and in the first one only where FIRST_WORK is right. Where valid
    voxels take next to none of them (light that leaves the scene, or goes where no camera path comes), or where no voxel
    guides, only every IDLE_PASSES-th pass has some, and few. */
 
@@ -170,9 +181,10 @@ static uint64_t photon_wants_photons(void *method, const tr_pass *pass)
 {
     photon *m = method;
     photon_budget *b = &m->budget;
-    double rate = m->adapts ? b->rate : m->per_path;
     gph_stats s;
     gph_get_stats(m->field, &s);
+    double paths = m->paths * pass->spp, camera = paths + (double)(s.vertices - b->vertices);
+    double rate = m->adapts ? fmin(m->per_path, WORK_SHARE * camera / paths / b->each) : m->per_path;
     bool closed = s.maps > 0 && gph_all_closed(m->field), useless = m->adapts && b->poor >= PATIENCE;
     m->flux = 0;
     if (pass->last)
@@ -181,28 +193,27 @@ static uint64_t photon_wants_photons(void *method, const tr_pass *pass)
         b->skipped += rate > 0;
         return 0;
     }
-    m->flux = floor((useless ? PROBE_SHARE : 1) * rate * m->paths * pass->spp + 0.5);
+    m->flux = floor((useless ? PROBE_SHARE : 1) * rate * paths + 0.5);
+    b->rate = m->flux / paths;
     b->passes += m->flux > 0;
     return (uint64_t)m->flux;
 }
 
-/* After a pass: what its photons were good for, and how many the next one may have. */
-static void photon_judge(photon *m, const tr_pass *pass)
+/* After a pass: what its photons cost and were good for. */
+static void photon_judge(photon *m)
 {
     photon_budget *b = &m->budget;
     gph_stats s;
-    double handed = 0, camera = m->paths * pass->spp;
+    double handed = 0;
     gph_get_stats(m->field, &s);
-    camera += (double)(s.vertices - b->vertices);
     for (int i = 0; i < m->photon_tiles; ++i) {
         handed += (double)b->handed[i];
         b->handed[i] = 0;
     }
     if (m->flux > 0) {
-        double each = 1 + handed / m->flux; /* work of a path */
+        b->each = 1 + handed / m->flux;
         b->yield = (double)(s.photons - b->taken) / m->flux;
         b->poor = b->yield < MIN_YIELD ? b->poor + 1 : 0;
-        b->rate = fmin(m->per_path, WORK_SHARE * camera / (m->paths * pass->spp) / each);
     }
     b->vertices = s.vertices;
     b->taken = s.photons;
@@ -255,7 +266,8 @@ static bool photon_record_photons(void *method, int tile, const tr_photon *photo
             memcpy(at, &p->p, sizeof at);
             double known = m->emission ? gph_photons_at(m->field, at) : -1;
             if (known >= 0)
-                ok = tr_emission_record(m->emission, tile, p->u, p->density, (float)(1 / (known + FEW_PHOTONS))) && ok;
+                ok = tr_emission_map_record(m->emission, tile, p->u, p->density, (float)(1 / (known + FEW_PHOTONS))) &&
+                     ok;
             memcpy(from, &p->wi, sizeof from);
             samples[k++] = gph_make_photon(at, from, p->distance,
                                            (float)((double)((p->flux.x + p->flux.y + p->flux.z) / 3) * m->flux));
@@ -277,7 +289,7 @@ static void photon_flush(void *method)
     for (int i = 0; i < streams; ++i)
         gph_stream_clear(m->streams[i]);
     if (m->emission)
-        tr_emission_flush(m->emission);
+        tr_emission_map_flush(m->emission);
 }
 
 static bool photon_end_pass(void *method, const tr_pass *pass)
@@ -290,8 +302,8 @@ static bool photon_end_pass(void *method, const tr_pass *pass)
     bool ok = !result && (!m->net || photon_net_refine(m->net, m->field, m->parallel, m->parallel_user));
     m->view = gph_get_view(m->field);
     if (m->emission && m->flux > 0)
-        tr_emission_learn(m->emission);
-    photon_judge(m, pass);
+        tr_emission_map_learn(m->emission);
+    photon_judge(m);
     return ok;
 }
 
@@ -358,7 +370,8 @@ static void photon_stats(void *method, tr_method_stats *stats)
     stats->refused = s.refused;
     stats->cells = s.voxels;
     stats->bytes = s.bytes;
-    stats->extra_bytes = (double)m->stream_peak;
+    stats->extra_bytes = (double)(m->stream_peak + (uint64_t)m->photon_tiles * sizeof *m->budget.handed +
+                                  (m->emission ? tr_emission_map_bytes(m->emission) : 0));
     snprintf(stats->json, sizeof stats->json,
              "\"passes\": %u, \"clamped\": %llu, \"lost\": %llu, \"denied\": %llu, \"kept_photons\": %llu, "
              "\"cubes\": %u, \"maps\": %u, \"valid\": %u, \"sparse\": %u, \"levels\": %u, \"splits\": %llu, "
@@ -372,7 +385,7 @@ static void photon_stats(void *method, tr_method_stats *stats)
              s.closed_voxels, s.unjudged_voxels, (unsigned long long)s.opened, (unsigned long long)s.closed,
              (unsigned long long)s.probed, (double)s.closed_share, (double)s.mean_alpha, (double)s.useful_share,
              m->budget.rate, m->budget.yield, m->budget.passes, m->budget.skipped,
-             m->emission ? tr_emission_gain(m->emission) : 1);
+             m->emission ? tr_emission_map_gain(m->emission) : 1);
     if (m->net) {
         size_t n = strlen(stats->json);
         photon_net_stats(m->net, stats->json + n, sizeof stats->json - n);

@@ -58,7 +58,7 @@ static void emit(photon_worker *w, const tr_photon_pass *pass, uint64_t first, i
         u[0] = rng_float(&p->rng);
         rng_float2(&p->rng, &u[1], &u[2]);
         rng_float2(&p->rng, &u[3], &u[4]);
-        p->density = tr_emission_warp(pass->emission, u);
+        p->density = tr_emission_map_warp(pass->emission, u);
         if (!tr_light_emit(pass->scene, u, &e))
             continue;
         p->flux = scale3(e.flux, share / p->density);
