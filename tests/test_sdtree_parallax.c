@@ -642,7 +642,7 @@ static void *taught(int kind, int level, size_t *size)
 }
 
 /* Whatever the level, samples teach the same, to the bit. */
-static void test_learning_is_the_same_at_all_levels(void **state)
+static void test_learning_changes_no_bit_between_levels(void **state)
 {
     (void)state;
     for (int kind = 0; kind < 8; ++kind) {
@@ -675,7 +675,7 @@ int main(void)
         cmocka_unit_test(test_nearness_is_there_at_once),
         cmocka_unit_test(test_sums_are_those_of_the_sphere),
         cmocka_unit_test(test_distances),
-        cmocka_unit_test(test_learning_is_the_same_at_all_levels),
+        cmocka_unit_test(test_learning_changes_no_bit_between_levels),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
