@@ -158,9 +158,10 @@
      same as gsd_pdf for it, but for some 4e-6 of directions near the poles of trees of depth 20 with parallax. phi is
      computed to 4e-8 rad. SIMD levels differ from scalar by <= 2e-6 relative (4e-6 with parallax), and by the
      neighbour's density for about 1e-6 of directions within rounding of a leaf's edge. accumulate and refine give the
-     same bits at all levels (not with clang's -ffp-contract=fast, nor with -ffast-math), but for the matrices of
-     GSD_DENOISE_GAUSSIAN: they differ by <= 1e-6 relative, so that a node within that of the threshold is divided at
-     one level and not at another.
+     same bits at all levels (not with clang's -ffp-contract=fast, nor with -ffast-math, nor with gcc's -fno-inline),
+     but for the matrices of GSD_DENOISE_GAUSSIAN: they differ by <= 1e-6 relative, so that a node within that of the
+     threshold is divided at one level and not at another. After the header clang's FP_CONTRACT is what the command
+     line says, whatever a pragma said before it.
 
    REFERENCES
      T. Mueller, M. Gross, J. Novak 2017, Practical Path Guiding for Efficient Light-Transport Simulation.
@@ -5361,7 +5362,8 @@ typedef struct gsdi_looks {
 } gsdi_looks;
 
 /* Coordinates in the quadtree, of queries from i on: one, or eight. */
-GSDI_FLATTEN static void gsdi_look(gsdi_looks *k, uint32_t i, const gsd_handle *handles, const float *directions, size_t stride)
+GSDI_FLATTEN static void gsdi_look(gsdi_looks *k, uint32_t i, const gsd_handle *handles, const float *directions,
+                                   size_t stride)
 {
     float seen[3];
     k->scale[i] = gsd_to_pivot(handles[k->at[i]].offset, gsdi_row(directions, stride, k->at[i]), seen);
