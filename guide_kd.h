@@ -82,7 +82,9 @@
      other direction. MIS with other techniques weighs therefore by m = alpha pdf_bsdf + (1 - alpha) gkd_pdf, on both
      sides: weights have to sum to 1 for each direction, no more, as the quotient by the returned pdf is an unbiased
      estimate of any integral, that with a weight too. On diffuse surfaces there is nothing to gain: n = 1 is
-     one-sample MIS.
+     one-sample MIS. Divided by the returned pdf, radiance alone has heavy tails where the BSDF vanishes: what is hardly
+     ever taken weighs much. Mixtures bear it, as no sample weighs more than a share of its batch (a cap, which biases
+     them, not the picture); signatures and the gate take it as it is.
 
      Gate: guiding is used in a cell until its own samples show that it does not pay. V(a) = mean of g^2 / (p p_a), with
      g = contribution, p_a = a pdf_bsdf + (1 - a) pdf_guide, is the second moment with selection probability a; m = mean
@@ -101,7 +103,7 @@
      vertex not included. distance: to the next vertex, INFINITY = the environment. Zeros count: record them.
      gkd_make_sample fills one from RGB arrays; the normal is the one that gkd_find got. A direction rejected before
      tracing (f = 0) has radiance GKD_REJECTED (-0.0f): it counts for the gate only. pdf_guide = 0 means "not
-   evaluated".
+     evaluated".
 
    OPTIONS: see gkd_desc. gkd_resolve fills in defaults, gkd_get_desc returns what a field uses.
 
@@ -848,7 +850,7 @@ GKD_QUERY float gkd_candidate_target(const gkd_candidate *c)
     return target > 0 && target < 1e30f ? target : 0;
 }
 
-/* Choose one of `count` candidates (at least 1), u in [0,1): see RESAMPLING. Returns its index and in *pdf what its
+/* Choose one of `count` candidates (at least 1), u in [0,1): see Resampling. Returns its index and in *pdf what its
    contribution is to be divided by; `count` and 0 where none can be taken: the contribution is 0. [any thread] */
 GKD_QUERY uint32_t gkd_resample(const gkd_candidate *candidates, uint32_t count, float alpha, float u, float *pdf)
 {

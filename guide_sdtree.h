@@ -39,8 +39,7 @@
      >>field     create, refine, stats         >>store   save, load, merge, export, import
      implementation:
      >>memory  >>math  >>streams  >>trees  >>denoise  >>gaussian  >>lanes  >>accumulate  >>gate  >>block  >>refine
-   >>life
-     >>forest  >>batches  >>files  >>check  >>plain  >>licence
+     >>life  >>forest  >>batches  >>files  >>check  >>plain  >>licence
 
    HOW IT WORKS
      Space is a binary tree over a cube: axes in turn, cut in the middle. A leaf (*cell*) splits when it holds more than
@@ -159,9 +158,10 @@
      same as gsd_pdf for it, but for some 4e-6 of directions near the poles of trees of depth 20 with parallax. phi is
      computed to 4e-8 rad. SIMD levels differ from scalar by <= 2e-6 relative (4e-6 with parallax), and by the
      neighbour's density for about 1e-6 of directions within rounding of a leaf's edge. accumulate and refine give the
-     same bits at all levels (not with clang's -ffp-contract=fast, nor with -ffast-math), but for the matrices of
-     GSD_DENOISE_GAUSSIAN: they differ by <= 1e-6 relative, so that a node within that of the threshold is divided at
-     one level and not at another.
+     same bits at all levels (not with clang's -ffp-contract=fast, nor with -ffast-math, nor with gcc's -fno-inline),
+     but for the matrices of GSD_DENOISE_GAUSSIAN: they differ by <= 1e-6 relative, so that a node within that of the
+     threshold is divided at one level and not at another. After the header clang's FP_CONTRACT is what the command
+     line says, whatever a pragma said before it.
 
    REFERENCES
      T. Mueller, M. Gross, J. Novak 2017, Practical Path Guiding for Efficient Light-Transport Simulation.
@@ -659,9 +659,15 @@ GSD_QUERY void gsd_offset(const float pivot[3], float nearness, const float posi
    per solid angle here: t^2 / s with s^2 = 1 - |o|^2 + (o . w)^2, t = s - o . w. Without offset nothing changes. */
 GSD_QUERY float gsd_to_pivot(const float offset[3], const float direction[3], float out[3])
 {
-    float b = (offset[0] * direction[0] + offset[1] * direction[1]) + offset[2] * direction[2];
-    float l = (offset[0] * offset[0] + offset[1] * offset[1]) + offset[2] * offset[2];
-    float s = sqrtf((1 - l) + b * b), t = s - b;
+    float b, l, s, t;
+    if (!(offset[0] != 0 || offset[1] != 0 || offset[2] != 0)) { /* the rest would make NaN of infinity */
+        memcpy(out, direction, 3 * sizeof *out);
+        return 1;
+    }
+    b = (offset[0] * direction[0] + offset[1] * direction[1]) + offset[2] * direction[2];
+    l = (offset[0] * offset[0] + offset[1] * offset[1]) + offset[2] * offset[2];
+    s = sqrtf((1 - l) + b * b);
+    t = s - b;
     out[0] = offset[0] + t * direction[0];
     out[1] = offset[1] + t * direction[1];
     out[2] = offset[2] + t * direction[2];
@@ -5194,12 +5200,6 @@ GSD_API gsd_result gsd_forest_split(gsd_field *field, uint32_t parent, uint32_t 
     return GSD_OK;
 }
 
-#if defined(__clang__)
-#pragma STDC FP_CONTRACT DEFAULT
-#elif defined(__GNUC__)
-#pragma GCC pop_options
-#endif
-
 /* ---- >>batches ---------------------------------------------------------------------------------------------- */
 
 #define GSDI_LANES 64u /* queries in flight; 16 and 32 wait for memory longer */
@@ -5262,6 +5262,25 @@ GSDI_AVX2 static void gsdi_bin_weights_avx2(const gsd_view *view, const gsd_hand
 }
 #endif
 
+/* Inline queries for what the lanes leave over, in the same bits. */
+GSDI_FLATTEN static void gsdi_orient_one(const gsd_view *view, gsd_handle *handle, const float *normal)
+{
+    gsd_orient(view, handle, normal);
+}
+GSDI_FLATTEN static float gsdi_pdf_one(const gsd_view *view, const gsd_handle *handle, const float *direction)
+{
+    return gsd_pdf(view, handle, direction);
+}
+GSDI_FLATTEN static float gsdi_sample_one(const gsd_view *view, const gsd_handle *handle, const float *u, float *out)
+{
+    return gsd_sample(view, handle, u, out);
+}
+GSDI_FLATTEN static float gsdi_oriented(const gsd_view *view, const gsd_handle *handle, float pdf, uint32_t x,
+                                        uint32_t y, float scale)
+{
+    return gsd_oriented(view, handle, pdf, x, y, scale);
+}
+
 static void gsdi_orient(const gsd_view *view, gsd_handle *handle, const float *normal)
 {
 #if GSDI_X86
@@ -5270,7 +5289,7 @@ static void gsdi_orient(const gsd_view *view, gsd_handle *handle, const float *n
         return;
     }
 #endif
-    gsd_orient(view, handle, normal);
+    gsdi_orient_one(view, handle, normal);
 }
 
 GSD_API void gsd_find_batch(const gsd_view *view, uint32_t count, const uint32_t *index, const float *positions,
@@ -5343,7 +5362,8 @@ typedef struct gsdi_looks {
 } gsdi_looks;
 
 /* Coordinates in the quadtree, of queries from i on: one, or eight. */
-static void gsdi_look(gsdi_looks *k, uint32_t i, const gsd_handle *handles, const float *directions, size_t stride)
+GSDI_FLATTEN static void gsdi_look(gsdi_looks *k, uint32_t i, const gsd_handle *handles, const float *directions,
+                                   size_t stride)
 {
     float seen[3];
     k->scale[i] = gsd_to_pivot(handles[k->at[i]].offset, gsdi_row(directions, stride, k->at[i]), seen);
@@ -5356,7 +5376,7 @@ GSDI_AVX2 static void gsdi_look_avx2(gsdi_looks *k, uint32_t i, const gsd_handle
 {
     const void *row[8];
     float in[3][8];
-    __m256 offset[4], d[3], scale = _mm256_set1_ps(1);
+    __m256 offset[4], d[3], seen[3], apart, scale = _mm256_set1_ps(1);
     __m256i x, y;
     uint32_t l, axis;
     for (l = 0; l < 8; ++l) {
@@ -5368,8 +5388,12 @@ GSDI_AVX2 static void gsdi_look_avx2(gsdi_looks *k, uint32_t i, const gsd_handle
     gsdi_columns_avx2(row, offset);
     for (axis = 0; axis < 3; ++axis)
         d[axis] = _mm256_loadu_ps(in[axis]);
-    if (_mm256_movemask_ps(gsdi_apart_avx2(offset + 1)))
-        scale = gsdi_to_pivot_avx2(offset + 1, d, d);
+    apart = gsdi_apart_avx2(offset + 1);
+    if (_mm256_movemask_ps(apart)) {
+        scale = gsdi_to_pivot_avx2(offset + 1, d, seen);
+        for (axis = 0; axis < 3; ++axis)
+            d[axis] = _mm256_blendv_ps(d[axis], seen[axis], apart);
+    }
     gsdi_coordinates_avx2(d, &x, &y);
     _mm256_storeu_ps(&k->scale[i], scale);
     _mm256_storeu_si256((__m256i *)(void *)&k->x[i], x);
@@ -5428,7 +5452,7 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
         for (i = 0; i < n; ++i) {
             const gsd_handle *h = &handles[k.at[i]];
             bool done = i < eights && !(h->product > 0);
-            pdf[k.at[i]] = done ? k.even[i] : gsd_oriented(view, h, k.pdf[i], k.x[i], k.y[i], k.scale[i]);
+            pdf[k.at[i]] = done ? k.even[i] : gsdi_oriented(view, h, k.pdf[i], k.x[i], k.y[i], k.scale[i]);
         }
     }
 }
@@ -5777,17 +5801,17 @@ GSDI_AVX2 static void gsdi_sample_avx2(const gsd_view *view, uint32_t n, const u
         const gsd_handle *h = &handles[at[i]];
         float *out = gsdi_row_out(directions, direction_stride, at[i]);
         if ((double)d.bits[0][i] < e * 16777216.0 + 1 || gsdi_aliased(h) != aliased) {
-            pdf[at[i]] = gsd_sample(view, h, gsdi_row(u, u_stride, at[i]), out);
+            pdf[at[i]] = gsdi_sample_one(view, h, gsdi_row(u, u_stride, at[i]), out);
             continue;
         }
         for (k = 0; k < 3; ++k)
             out[k] = d.out[k][i];
         if (d.edge[i] || (h->product > 0 && !d.deep[i]))
-            pdf[at[i]] = gsd_pdf(view, h, out);
+            pdf[at[i]] = gsdi_pdf_one(view, h, out);
         else if (!(h->product > 0))
             pdf[at[i]] = d.even[i];
         else
-            pdf[at[i]] = gsd_oriented(view, h, d.pdf[i], (uint32_t)d.r[0][i], (uint32_t)d.r[1][i], d.scale[i]);
+            pdf[at[i]] = gsdi_oriented(view, h, d.pdf[i], (uint32_t)d.r[0][i], (uint32_t)d.r[1][i], d.scale[i]);
     }
 }
 #endif
@@ -5838,6 +5862,12 @@ GSD_API void gsd_sample_batch(const gsd_view *view, uint32_t count, const uint32
         }
     }
 }
+
+#if defined(__clang__)
+#pragma STDC FP_CONTRACT DEFAULT
+#elif defined(__GNUC__)
+#pragma GCC pop_options
+#endif
 
 /* ---- >>files ------------------------------------------------------------------------------------------------ */
 

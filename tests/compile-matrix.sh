@@ -144,6 +144,21 @@ done >"$tmp/all.c"
 echo 'int main(void) { return 0; }' >>"$tmp/all.c"
 attempt "all headers in one file" ${compiler:-cc} -std=c99 $warn -I. "$tmp/all.c" -lm -o "$tmp/a.out"
 
+# Where the compiler may contract a * b + c, as it does for users who do not forbid it, the levels of SIMD still agree to
+# the bit. clang contracts at -O1 already.
+for c in gcc clang; do
+    name="guide_sdtree.h $c -mfma: same bits at all levels and places of a batch"
+    if command -v $c >/dev/null && grep -qsw avx2 /proc/cpuinfo && grep -qsw fma /proc/cpuinfo; then
+        level=-O2
+        [ $c = clang ] && level=-O1
+        $c -std=gnu11 $level -mavx2 -mfma -I. tests/test_sdtree_parallax.c -lcmocka -lm -lpthread -o "$tmp/fma" >"$log" 2>&1 &&
+            TEST_FILTER='*_no_bit*' "$tmp/fma" >"$log" 2>&1 && grep -q 'PASSED *\] 2 test' "$log"
+        report $? "$name"
+    else
+        skip "$name (not installed, or no such CPU)"
+    fi
+done
+
 # NEON's blur in an emulator, where there is one; on AArch64 itself test_sdtree_denoise runs it.
 name="guide_sdtree.h: NEON blur agrees with double precision (AArch64, emulated)"
 if command -v aarch64-linux-gnu-gcc >/dev/null && command -v qemu-aarch64 >/dev/null; then

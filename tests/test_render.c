@@ -329,13 +329,40 @@ static void guided_agrees_on_pool(void **state) { (void)state, guided_agrees("po
 static void guided_agrees_on_maze(void **state) { (void)state, guided_agrees("maze", "lamp_z", "-2.3", 100, true); }
 static void kd_agrees_on_ajar(void **state) { (void)state, method_agrees("kd", "ajar", "gap", "120", 127, true, 0); }
 static void kd_agrees_on_egg(void **state) { (void)state, method_agrees("kd", "egg", "bulb", "0.3", 100, true, 0); }
+
+/* The first is two candidates, both are three. */
+static tr_option three_candidates[] = {{"sampling", "ris", false}, {"candidates", "3", false}};
+
 /* Metal: candidates from both, MIS with next event estimation by their mixture. */
 static void resampled_agrees_on_gloss(void **state)
 {
-    tr_option three[] = {{"sampling", "ris", false}, {"candidates", "3", false}};
     (void)state;
-    method_agrees_with("kd", three, 1, "gloss", "bulb", "0.3", 100, true, 0);
-    method_agrees_with("kd", three, 2, "gloss", "bulb", "0.3", 100, false, 0);
+    method_agrees_with("kd", three_candidates, 1, "gloss", "bulb", "0.3", 100, true, 0);
+    method_agrees_with("kd", three_candidates, 2, "gloss", "bulb", "0.3", 100, false, 0);
+}
+
+/* That it agrees means something: the pictures are not those of one-sample MIS. */
+static void resampled_is_another_picture(void **state)
+{
+    (void)state;
+    tr_option mis = {"sampling", "mis", false};
+    tr_scene *scene = load("gloss", "bulb", "0.3");
+    tr_settings s = small("kd", 7);
+    tr_result r[3];
+    s.options = &mis;
+    s.option_count = 1;
+    r[0] = render(scene, &s);
+    s.options = three_candidates;
+    for (int k = 1; k < 3; ++k) {
+        s.option_count = k;
+        r[k] = render(scene, &s);
+    }
+    assert_true(mean_alpha(&r[0]) < 0.9);
+    for (int k = 0; k < 3; ++k)
+        assert_memory_not_equal(r[k].color.data, r[(k + 1) % 3].color.data, sizeof(float) * 80 * 48 * 3);
+    for (int k = 0; k < 3; ++k)
+        tr_result_free(&r[k]);
+    tr_scene_free(scene);
 }
 static void photons_agree_on_ajar(void **state)
 {
@@ -458,10 +485,13 @@ static void splitting_changes_no_mean(void **state)
 
 /* ---- >>identical -------------------------------------------------------------------------------------------- */
 
-static void same_for_threads(const char *method, int train)
+static void same_for_threads_with(const char *method, tr_option *options, int option_count, const char *scene_name,
+                                  int train)
 {
-    tr_scene *scene = load("ajar", NULL, NULL);
+    tr_scene *scene = load(scene_name, NULL, NULL);
     tr_settings s = small(method, 15);
+    s.options = options;
+    s.option_count = option_count;
     s.train = train;
     s.threads = 1;
     tr_result one = render(scene, &s);
@@ -482,10 +512,16 @@ static void same_for_threads(const char *method, int train)
     tr_scene_free(scene);
 }
 
+static void same_for_threads(const char *method, int train) { same_for_threads_with(method, NULL, 0, "ajar", train); }
+
 static void pt_is_identical_for_any_threads(void **state) { (void)state, same_for_threads("pt", 0); }
 static void sdtree_is_identical_for_any_threads(void **state) { (void)state, same_for_threads("sdtree", 0); }
 static void photons_are_identical_for_any_threads(void **state) { (void)state, same_for_threads("photon", 0); }
 static void trained_is_identical_for_any_threads(void **state) { (void)state, same_for_threads("sdtree", 9); }
+static void resampled_is_identical_for_any_threads(void **state)
+{
+    (void)state, same_for_threads_with("kd", three_candidates, 2, "gloss", 0);
+}
 
 /* With every gate closed the guided render is the unguided one. */
 static void closed_gate_changes_no_bit(void **state)
@@ -583,6 +619,7 @@ int main(void)
         cmocka_unit_test(kd_agrees_on_ajar),
         cmocka_unit_test(kd_agrees_on_egg),
         cmocka_unit_test(resampled_agrees_on_gloss),
+        cmocka_unit_test(resampled_is_another_picture),
         cmocka_unit_test(photons_agree_on_ajar),
         cmocka_unit_test(photons_agree_on_egg),
         cmocka_unit_test(splitting_changes_no_mean),
@@ -591,6 +628,7 @@ int main(void)
         cmocka_unit_test(sdtree_is_identical_for_any_threads),
         cmocka_unit_test(photons_are_identical_for_any_threads),
         cmocka_unit_test(trained_is_identical_for_any_threads),
+        cmocka_unit_test(resampled_is_identical_for_any_threads),
         cmocka_unit_test(training_is_not_in_the_picture),
         cmocka_unit_test(closed_gate_changes_no_bit),
         cmocka_unit_test(refuses_a_missing_budget_and_unknown_options),

@@ -308,6 +308,51 @@ static void test_batches_equal_single_queries(void **state)
     }
 }
 
+/* What a batch says of a query does not depend on what else is in it, to the bit, even where a direction is none. */
+static void test_neighbours_change_no_bit(void **state)
+{
+    enum { N = 1001 };
+    static const float strange[] = {NAN, INFINITY, -INFINITY};
+    static gsd_handle handles[N];
+    static float u[N][2], in[N][3], out[N][3], p[N][3], normal[N][3], drawn[N], asked[N];
+    gsd_field *f;
+    (void)state;
+    seed(7);
+    f = learned(GSD_TARGET_RADIANCE, false);
+    gsd_view v = gsd_get_view(f);
+    for (int i = 0; i < N; ++i) {
+        random_direction(in[i]);
+        if (rng_next() % 16 == 0)
+            in[i][rng_next() % 3] = strange[rng_next() % 3];
+        if (rng_next() % 2)
+            random_direction(normal[i]);
+        for (int k = 0; k < 3; ++k)
+            p[i][k] = rndf();
+        u[i][0] = rndf();
+        u[i][1] = rndf();
+    }
+    gsd_find_batch(&v, N, NULL, p[0], sizeof p[0], normal[0], sizeof normal[0], NULL, 0, handles, NULL);
+    for (int i = 0; i < N; i += 3) /* as in cells without parallax */
+        memset(handles[i].offset, 0, sizeof handles[i].offset);
+    for (uint32_t level = GSD_SIMD_SCALAR; level <= gsd_get_view(f).simd; ++level) {
+        v.simd = level;
+        gsd_sample_batch(&v, N, NULL, handles, u[0], sizeof u[0], out[0], sizeof out[0], drawn);
+        gsd_pdf_batch(&v, N, NULL, handles, in[0], sizeof in[0], asked);
+        for (uint32_t i = 0; i < N; ++i) {
+            const uint32_t same[8] = {0};
+            for (uint32_t n = 1; n <= 8; n += 7) { /* alone, and eight times */
+                float d[3], alone;
+                gsd_sample_batch(&v, n, same, &handles[i], u[i], sizeof u[i], d, sizeof d, &alone);
+                assert_memory_equal(d, out[i], sizeof d);
+                assert_memory_equal(&alone, &drawn[i], sizeof alone);
+                gsd_pdf_batch(&v, n, same, &handles[i], in[i], sizeof in[i], &alone);
+                assert_memory_equal(&alone, &asked[i], sizeof alone);
+            }
+        }
+    }
+    gsd_destroy(f);
+}
+
 /* ---- learning */
 
 /* Mean density of the directions to the lamp's middle, over the cell. */
@@ -597,7 +642,7 @@ static void *taught(int kind, int level, size_t *size)
 }
 
 /* Whatever the level, samples teach the same, to the bit. */
-static void test_learning_is_the_same_at_all_levels(void **state)
+static void test_learning_changes_no_bit_between_levels(void **state)
 {
     (void)state;
     for (int kind = 0; kind < 8; ++kind) {
@@ -623,13 +668,14 @@ int main(void)
         cmocka_unit_test(test_density_integrates_to_one),
         cmocka_unit_test(test_samples_follow_the_density),
         cmocka_unit_test(test_batches_equal_single_queries),
+        cmocka_unit_test(test_neighbours_change_no_bit),
         cmocka_unit_test(test_near_lamp_stays_sharp),
         cmocka_unit_test(test_estimates_are_unbiased),
         cmocka_unit_test(test_pivots),
         cmocka_unit_test(test_nearness_is_there_at_once),
         cmocka_unit_test(test_sums_are_those_of_the_sphere),
         cmocka_unit_test(test_distances),
-        cmocka_unit_test(test_learning_is_the_same_at_all_levels),
+        cmocka_unit_test(test_learning_changes_no_bit_between_levels),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

@@ -650,7 +650,7 @@ static inline void choose(tr_worker *w, int id, choice *ch)
     rng_float2(&p->rng, &u0, &u1);
     rng_float2(&p->rng, &u2, &u3);
     ch->kind = CHOICE_NONE;
-    ch->pdf = 0;
+    ch->pdf = ch->pdf_bsdf = 0;
     if (u0 < c->delta_probability) {
         if (tr_closure_sample_delta(c, u1, &ch->wi, &ch->f, &ch->pdf_bsdf))
             ch->kind = CHOICE_DELTA;
@@ -749,6 +749,8 @@ static void choose_candidate(tr_worker *w, const tr_frame *frame, int k, const c
     }
     at = frame->method->resample(frame->method_data, handle, offers, n, w->alpha[k], rng_float(&w->paths[id].guide_rng),
                                  &pdf);
+    if (!(pdf > 0))
+        at = n;
     ch->kind = CHOICE_NONE;
     for (int j = 0; at == n && j < n && ch->kind == CHOICE_NONE; ++j) {
         *ch = c[j].choice;

@@ -70,8 +70,11 @@ static bool parse(parser *p, gkd_desc *d, kd *m)
     m->sparse = choice(p, "sparse", "off|on") != 0;
     m->time_structure = choice(p, "time_structure", "off|on") == 1;
     m->candidates = choice(p, "sampling", "mis|ris") == 1 ? (int)whole(p, "candidates", 2) : 1;
-    if (m->candidates < 1 || m->candidates > TR_MAX_CANDIDATES)
-        complain(p, "candidates", option(p->env, "candidates"), "1 .. 8");
+    if (m->candidates < 1 || m->candidates > TR_MAX_CANDIDATES) {
+        char range[16];
+        snprintf(range, sizeof range, "1 .. %d", TR_MAX_CANDIDATES);
+        complain(p, "candidates", option(p->env, "candidates"), range);
+    }
     return p->ok;
 }
 

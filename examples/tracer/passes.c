@@ -628,6 +628,8 @@ static bool create_method(render_state *r, char *err, size_t err_size)
     if (!r->frame.method_data)
         return fail(err, err_size, "the method could not start: out of memory");
     r->frame.candidates = m->candidates && m->resample ? m->candidates(r->frame.method_data) : 1;
+    if (r->frame.candidates < 1 || r->frame.candidates > TR_MAX_CANDIDATES)
+        return fail(err, err_size, "the method wants no candidates, or too many");
     for (int i = 0; i < s->option_count; ++i)
         if (!s->options[i].used) {
             snprintf(err, err_size, "--set %s: method '%s' has no such option", s->options[i].key, s->method->name);
