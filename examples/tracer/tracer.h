@@ -587,8 +587,8 @@ typedef struct tr_method {
     /* Density of wi[index[i]] under handles[index[i]], to pdf[index[i]]. */
     void (*pdf)(void *method, int n, const int *index, const void *handles, const vec3 *wi, float *pdf);
     /* Resampling: directions to draw at each guided vertex that is not diffuse, alpha of them from the bsdf; NULL: one,
-       which is one-sample MIS. At most TR_MAX_CANDIDATES. resample chooses among n = candidates(): the index and in *pdf what to divide by, n
-       where none can be taken. */
+       which is one-sample MIS. At most TR_MAX_CANDIDATES. resample chooses among n = candidates(): the index and in
+       *pdf what to divide by, n where none can be taken. */
     int (*candidates)(void *method);
     int (*resample)(void *method, const void *handle, const tr_candidate *candidates, int n, float alpha, float u,
                     float *pdf);
