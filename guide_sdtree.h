@@ -5267,6 +5267,7 @@ GSDI_FLATTEN static void gsdi_orient_one(const gsd_view *view, gsd_handle *handl
 {
     gsd_orient(view, handle, normal);
 }
+#if GSDI_X86
 GSDI_FLATTEN static float gsdi_pdf_one(const gsd_view *view, const gsd_handle *handle, const float *direction)
 {
     return gsd_pdf(view, handle, direction);
@@ -5275,6 +5276,7 @@ GSDI_FLATTEN static float gsdi_sample_one(const gsd_view *view, const gsd_handle
 {
     return gsd_sample(view, handle, u, out);
 }
+#endif
 GSDI_FLATTEN static float gsdi_oriented(const gsd_view *view, const gsd_handle *handle, float pdf, uint32_t x,
                                         uint32_t y, float scale)
 {
