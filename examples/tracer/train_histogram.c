@@ -854,6 +854,16 @@ static void start_runner(runner *r, gnn_unet *net, uint32_t batch, int threads)
     r->pool = threads > 1 ? need(tr_pool_create(threads)) : NULL;
 }
 
+static void end_runner(runner *r)
+{
+    gnn_unet_destroy(r->net);
+    free(r->workspace);
+    free(r->inputs);
+    free(r->outputs);
+    free(r->targets);
+    tr_pool_destroy(r->pool);
+}
+
 /* Maps of low .. high photons, every stride-th. */
 static void judge_net(runner *r, const set *s, float low, float high, uint32_t stride, tally *t, double *loss)
 {
@@ -1207,5 +1217,10 @@ int main(int argc, char **argv)
     report(&r, &sets[1], there || s.step > 0);
     if (o.weights && (there || s.step > 0))
         save_net(r.net, GNN_TYPE_F16, o.weights, &s);
+    end_runner(&r);
+    for (int k = 0; k < 2; ++k) {
+        free(sets[k].maps);
+        free(sets[k].photons);
+    }
     return 0;
 }
