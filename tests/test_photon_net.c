@@ -11,6 +11,7 @@
 
 #include "photon_net.h"
 #include "rng.h"
+#include "scene_internal.h"
 #include "threads.h"
 
 #define WEIGHTS "examples/weights/histogram.safetensors"
@@ -245,7 +246,7 @@ static void refuse(const char *path, const void *data, size_t size, const char *
 static void broken_weights_are_refused_with_file_and_remedy(void **state)
 {
     size_t size;
-    unsigned char *data = pn_read_file(WEIGHTS, &size);
+    unsigned char *data = tr_file_read(WEIGHTS, &size, NULL, 0);
     (void)state;
     assert_non_null(data);
     assert_true(size > 1000 && size <= 1u << 20);

@@ -166,22 +166,28 @@ unsigned char *tr_file_read(const char *path, size_t *size, char *err, size_t er
 {
     unsigned char *data = NULL;
     long length = -1;
+    int why = 0;
     *size = 0;
     errno = 0;
     FILE *f = fopen(path, "rb");
-    if (f && fseek(f, 0, SEEK_END) == 0 && (length = ftell(f)) >= 0 && length < LONG_MAX - 1 &&
+    if (f)
+        (void)fgetc(f); /* a folder opens, but says here what it is */
+    if (f && !ferror(f) && fseek(f, 0, SEEK_END) == 0 && (length = ftell(f)) >= 0 && length < LONG_MAX - 1 &&
         fseek(f, 0, SEEK_SET) == 0)
         data = malloc((size_t)length + 1);
     if (data && fread(data, 1, (size_t)length, f) == (size_t)length) {
         data[length] = 0;
         *size = (size_t)length;
     } else {
-        fail(err, err_size, "cannot read '%s': %s", path, strerror(errno ? errno : EIO));
+        why = errno ? errno : EIO;
+        fail(err, err_size, "cannot read '%s': %s", path, strerror(why));
         free(data);
         data = NULL;
     }
     if (f)
         fclose(f);
+    if (!data)
+        errno = why;
     return data;
 }
 

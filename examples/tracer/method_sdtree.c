@@ -11,6 +11,7 @@
    writes the field when the training ends; compare=FILE,FILE,... judges such fields by the samples of the picture, see
    >>rivals. */
 #include "method_options.h"
+#include "scene_internal.h"
 #include "threads.h"
 
 #define GSD_IMPLEMENTATION
@@ -105,14 +106,11 @@ static void rivals_free(sdtree *m)
 static gsd_field *load_field(const char *path)
 {
     gsd_field *field = NULL;
-    FILE *f = fopen(path, "rb");
-    long size = f && !fseek(f, 0, SEEK_END) ? ftell(f) : -1;
-    void *data = size > 0 ? malloc((size_t)size) : NULL;
-    if (data && !fseek(f, 0, SEEK_SET) && fread(data, 1, (size_t)size, f) == (size_t)size)
-        gsd_load(NULL, data, (size_t)size, &field);
+    size_t size;
+    void *data = tr_file_read(path, &size, NULL, 0);
+    if (data)
+        gsd_load(NULL, data, size, &field);
     free(data);
-    if (f)
-        fclose(f);
     return field;
 }
 

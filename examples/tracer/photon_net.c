@@ -5,6 +5,7 @@
      >>visits   which voxels camera paths meet
      >>refine   which maps, and how many */
 #include "photon_net.h"
+#include "scene_internal.h"
 
 #include <errno.h>
 #include <float.h>
@@ -114,28 +115,6 @@ struct photon_net {
     float *inputs, *outputs, *maps;
 };
 
-void *pn_read_file(const char *path, size_t *size)
-{
-    FILE *f = fopen(path, "rb");
-    char *data = NULL;
-    long end = 0;
-    if (!f)
-        return NULL;
-    errno = 0;
-    (void)fgetc(f); /* a folder opens, but says here what it is */
-    if (!ferror(f) && !fseek(f, 0, SEEK_END) && (end = ftell(f)) >= 0 && !fseek(f, 0, SEEK_SET))
-        data = malloc((size_t)end + 1);
-    *size = data ? fread(data, 1, (size_t)end, f) : 0;
-    if (data && *size != (size_t)end) {
-        free(data);
-        data = NULL;
-    }
-    int why = errno ? errno : EIO;
-    fclose(f);
-    errno = why;
-    return data;
-}
-
 /* The weights beside the folder that the program runs from, whatever folder it is called from. */
 static bool beside_program(char *path, size_t size)
 {
@@ -155,10 +134,10 @@ static bool load_weights(photon_net *n, const char *path, char *err, size_t err_
     bool looked = !path && beside_program(beside, sizeof beside);
     size_t size = 0;
     const char *named = path ? path : looked ? beside : WEIGHTS;
-    void *data = pn_read_file(named, &size);
+    void *data = tr_file_read(named, &size, NULL, 0);
     gnn_message message = {""};
     if (!data && looked && errno == ENOENT)
-        data = pn_read_file(named = WEIGHTS, &size);
+        data = tr_file_read(named = WEIGHTS, &size, NULL, 0);
     if (!data) {
         const char *why = strerror(errno);
         bool both = looked && named != beside;

@@ -27,8 +27,6 @@ void pn_truth(const float *truth, float *target);
 void pn_map(const float *repaired, const float *output, float *map);
 /* The map that a handle samples, as floats with mean 1. */
 void pn_repaired(const gph_handle *handle, float *map);
-/* All of a file, freed by the caller; NULL with errno: ENOENT only where there is none. */
-void *pn_read_file(const char *path, size_t *size);
 
 /* ---- in the renderer */
 

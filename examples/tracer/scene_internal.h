@@ -107,7 +107,8 @@ bool tr_mesh_load(tr_shape *shape, const char *path, const tr_mesh_options *opti
 bool tr_ply_read(tr_shape *shape, const unsigned char *data, size_t size, char *err, size_t err_size);
 /* Run call(context) in a child process; false = it crashed or took minutes there. */
 bool tr_survives(void (*call)(void *), void *context);
-/* The whole file in memory with a 0 byte after it, NULL = could not read (reason in err). */
+/* The whole file in memory with a 0 byte after it; NULL = could not read (reason in err and errno: ENOENT only where
+   there is none). */
 unsigned char *tr_file_read(const char *path, size_t *size, char *err, size_t err_size);
 
 /* ---- >>colour ----------------------------------------------------------------------------------------------- */

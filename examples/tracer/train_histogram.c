@@ -310,13 +310,18 @@ typedef struct set {
     uint32_t count, capacity, planes;
 } set;
 
+static void set_reserve(set *s, uint32_t capacity)
+{
+    s->capacity = capacity;
+    s->maps =
+        need(realloc(s->maps, ((size_t)capacity * s->planes * PN_AREA + 1) * sizeof(float))); /* 0 is no failure */
+    s->photons = need(realloc(s->photons, ((size_t)capacity * 2 + 1) * sizeof(float)));
+}
+
 static float *set_push(set *s)
 {
-    if (s->count == s->capacity) {
-        s->capacity = s->capacity ? 2 * s->capacity : 256;
-        s->maps = need(realloc(s->maps, (size_t)s->capacity * s->planes * PN_AREA * sizeof(float)));
-        s->photons = need(realloc(s->photons, (size_t)s->capacity * 2 * sizeof(float)));
-    }
+    if (s->count == s->capacity)
+        set_reserve(s, s->capacity ? 2 * s->capacity : 256);
     return s->maps + (size_t)s->count++ * s->planes * PN_AREA;
 }
 static float *set_map(const set *s, uint32_t i) { return s->maps + (size_t)i * s->planes * PN_AREA; }
@@ -611,7 +616,7 @@ static void run_room(const options *o, int number, set *to)
 /* NULL = there is none. One that is there and cannot be read is not for this program to write over. */
 static void *read_file(const char *path, size_t *size)
 {
-    void *data = pn_read_file(path, size);
+    void *data = tr_file_read(path, size, NULL, 0);
     if (!data && errno != ENOENT)
         die(path, strerror(errno));
     return data;
@@ -696,9 +701,7 @@ static bool load_data(const options *o, const char *path, int *rooms, set sets[2
             die(path, "not a data set of this program: remove it, or name another one by --data");
         size_t n = (size_t)a->shape[0];
         set *s = &sets[k];
-        s->capacity = s->count + (uint32_t)n;
-        s->maps = need(realloc(s->maps, ((size_t)s->capacity * s->planes * PN_AREA + 1) * sizeof(float)));
-        s->photons = need(realloc(s->photons, ((size_t)s->capacity * 2 + 1) * sizeof(float)));
+        set_reserve(s, s->count + (uint32_t)n);
         if (!gnn_tensor_floats(a, 0, n * s->planes * PN_AREA, set_map(s, s->count)) ||
             !gnn_tensor_floats(b, 0, n * 2, s->photons + 2 * (size_t)s->count))
             die(path, "not of numbers that this program reads");
