@@ -232,22 +232,12 @@ static void bench_field(bool quick)
     gkd_stats stats;
     double seconds, samples, load = bench_load_throughput((size_t)1 << 18);
     queries *q = allocate(1, sizeof *q);
-    sf1_rng rng = {77};
     memset(&desc, 0, sizeof desc);
     desc.bounds_max[0] = desc.bounds_max[1] = desc.bounds_max[2] = 1;
     gkd_field *field = learn(&desc, quick ? 17 : 20, 1, &seconds, &samples);
     gkd_view view = gkd_get_view(field);
     gkd_get_stats(field, &stats);
-    for (int i = 0; i < DIRECTIONS;) {
-        sf1_sample s;
-        if (!sf1_draw(&sf1_default, &rng, 4, 0, &s))
-            continue;
-        memcpy(q->position[i], s.position, sizeof q->position[i]);
-        memcpy(q->normal[i], s.normal, sizeof q->normal[i]);
-        memcpy(q->given[i], s.direction, sizeof q->given[i]);
-        q->u[i][0] = (float)(0.999999 * sf1_uniform(&rng));
-        q->u[i++][1] = (float)(0.999999 * sf1_uniform(&rng));
-    }
+    sf1_queries(77, DIRECTIONS, q->position, q->normal, q->given, q->u);
     printf("\nSF1: %u cells, %.1f lobes each, %.0f bytes a cell in both parts, %llu lookahead cells\n", stats.cells,
            (double)stats.lobes / stats.cells, (double)stats.bytes / stats.cells, (unsigned long long)stats.lookahead);
     bench_queries(&view, q);

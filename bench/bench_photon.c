@@ -387,22 +387,12 @@ static void bench_queries(const gph_view *view, queries *q)
 static void bench_field(int log2n)
 {
     queries *q = allocate(1, sizeof *q);
-    sf1_rng rng = {77};
     gph_stats stats;
     costs sum;
     gph_field *f = learn(log2n, 1, &sum);
     gph_view view = gph_get_view(f);
     gph_get_stats(f, &stats);
-    for (int i = 0; i < QUERIES;) {
-        sf1_sample s;
-        if (!sf1_draw(&sf1_default, &rng, 4, 0, &s))
-            continue;
-        memcpy(q->position[i], s.position, sizeof q->position[i]);
-        memcpy(q->normal[i], s.normal, sizeof q->normal[i]);
-        memcpy(q->given[i], s.direction, sizeof q->given[i]);
-        q->u[i][0] = (float)(0.999999 * sf1_uniform(&rng));
-        q->u[i++][1] = (float)(0.999999 * sf1_uniform(&rng));
-    }
+    sf1_queries(77, QUERIES, q->position, q->normal, q->given, q->u);
     printf("\nSF1: %u voxels, %u of them sparse, %.0f bytes each in both parts\n", stats.voxels, stats.sparse,
            (double)stats.bytes / stats.voxels);
     validate(&view, q);

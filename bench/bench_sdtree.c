@@ -56,30 +56,6 @@ typedef struct machine {
     double bandwidth;                         /* bytes per ns */
 } machine;
 
-static FILE *json_file;
-static int json_rows;
-
-/* limit and naive in ns; target 0 = none. */
-static void row(const char *name, bench_time t, double limit, double naive, double target)
-{
-    printf("%-44s %8.1f %8.1f %5.0f%% %8.1f %6.2fx %8.1f %6.2fx", name, t.min, t.median, 100 * t.spread, limit,
-           t.min / limit, naive, naive / t.min);
-    if (target > 0)
-        printf("   <= %3.0f %s", target, t.min <= target ? "reached" : "missed");
-    printf("\n");
-    if (json_file)
-        fprintf(json_file,
-                "%s\n  {\"name\": \"%s\", \"ns\": %.2f, \"median_ns\": %.2f, \"spread\": %.3f, \"limit_ns\": %.2f, "
-                "\"naive_ns\": %.2f, \"target_ns\": %.0f}",
-                json_rows++ ? "," : "", name, t.min, t.median, t.spread, limit, naive, target);
-}
-
-static void row_titles(const char *what)
-{
-    printf("%-44s %8s %8s %6s %8s %7s %8s %7s   target\n", what, "min", "median", "spread", "limit", "ratio", "naive",
-           "faster");
-}
-
 /* ---- the field of the queries ------------------------------------------------------------------------------- */
 
 static gsd_training_sample to_training(const sf1_sample *s)
@@ -590,7 +566,7 @@ static void bench_levels(const options *o, const gsd_view *view, const queries *
                 continue;
             snprintf(name, sizeof name, "%s, %s", w->name, level_name[level]);
             count_lines(view, q, w->kind, false, lines);
-            row(name, time_queries(o, w->fn, &v, q), lines_ns(m, lines, false), naive[w->kind], 0);
+            bench_row(name, time_queries(o, w->fn, &v, q), lines_ns(m, lines, false), naive[w->kind], 0);
         }
 }
 
@@ -624,8 +600,8 @@ static void bench_queries(const options *o, const gsd_view *v, const gsd_view *a
            "       independent, ns:\n");
     for (int k = 0; k < AREAS; ++k)
         printf("       %-30s %6.1f, independent %5.1f\n", area_name[k], m->latency[k], m->throughput[k]);
-    printf("lines: in these arrays; naive: without the product\n\n");
-    row_titles("ns per query");
+    printf("lines: in these arrays; naive: without the product\n");
+    bench_row_titles("ns per query");
     for (size_t i = 0; i < sizeof query_rows / sizeof *query_rows; ++i) {
         const query_row *w = &query_rows[i];
         const gsd_view *view = w->alias ? alias : v;
@@ -633,8 +609,8 @@ static void bench_queries(const options *o, const gsd_view *v, const gsd_view *a
         int like = w->kind >= QUERY_FIND_PRODUCT ? w->kind - QUERY_FIND_PRODUCT : w->kind;
         double lines[AREAS], all = 0;
         count_lines(view, what, w->kind, w->sorted, lines);
-        row(w->name, time_queries(o, w->fn, view, what), lines_ns(m, lines, w->single),
-            (w->sorted ? naive_sorted : naive)[like], w->target);
+        bench_row(w->name, time_queries(o, w->fn, view, what), lines_ns(m, lines, w->single),
+                  (w->sorted ? naive_sorted : naive)[like], w->target);
         for (int k = 0; k < AREAS; ++k)
             all += lines[k];
         printf("    %.1f lines: %.1f + %.1f + %.1f + %.1f + %.1f\n", all, lines[0], lines[1], lines[2], lines[3],
@@ -769,7 +745,7 @@ static void bench_learning(const options *o, const machine *m)
         "\nlearning SF1, 2^%d samples in %d updates; limit: four passes over the 48 bytes of a sample at %.1f GB/s\n",
         log2n, SF1_UPDATES, m->bandwidth);
     validate_learning(o);
-    row_titles("ns per sample");
+    bench_row_titles("ns per sample");
     double naive_ns = 0;
     gsd_desc resolved;
     check(gsd_resolve(&o->desc, &resolved), "resolve");
@@ -795,7 +771,7 @@ static void bench_learning(const options *o, const machine *m)
             gsd_get_stats(field, &stats);
             gsd_destroy(field);
         }
-        row(kind[k].name, bench_summary(times, repeats), 4 * 48 / m->bandwidth, naive_ns, kind[k].goal);
+        bench_row(kind[k].name, bench_summary(times, repeats), 4 * 48 / m->bandwidth, naive_ns, kind[k].goal);
         printf("    record %.1f, accumulate %.1f, refine %.1f ns/sample; %u cells, %.0f nodes and %.0f bytes per cell, "
                "%.1f bytes per node; mean depth %.1f\n",
                fastest.record / (double)fastest.samples * 1e9, fastest.accumulate / (double)fastest.samples * 1e9,
@@ -915,8 +891,8 @@ static void bench_denoise(const options *o, const machine *m)
         for (uint32_t c = 0; c < cells; ++c)
             denoise(&t, c);
     });
-    row_titles("ns per leaf");
-    row("denoise", time, 8 * m->cached, naive.min, 170);
+    bench_row_titles("ns per leaf");
+    bench_row("denoise", time, 8 * m->cached, naive.min, 170);
     free_trees(&t);
 }
 
@@ -998,7 +974,7 @@ static void parse(int argc, char **argv, options *o)
         else if (!strcmp(a, "--set"))
             set_option(&o->desc, argv[++i]);
         else if (!strcmp(a, "--json")) {
-            if (!(json_file = fopen(argv[++i], "w")))
+            if (!(bench_json = fopen(argv[++i], "w")))
                 fail("cannot write the JSON file");
         } else
             fail("unknown option; the first lines of bench_sdtree.c list them");
@@ -1014,11 +990,8 @@ int main(int argc, char **argv)
     parse(argc, argv, &o);
     o.repeats = o.quick ? 2 : 12;
     o.queries = o.quick ? 1 << 16 : 1 << 18;
-    bench_print_machine(json_file);
+    bench_print_machine(bench_json);
     run_micro(&o);
-    if (json_file) {
-        fprintf(json_file, "\n]}\n");
-        fclose(json_file);
-    }
+    bench_close_json();
     return 0;
 }

@@ -12,6 +12,7 @@
 
 #include <math.h>
 #include <stdint.h>
+#include <string.h>
 
 #define SF1_PI 3.14159265358979323846
 #define SF1_MAX_SOURCES 64
@@ -206,6 +207,23 @@ static inline int sf1_draw(const sf1_field *field, sf1_rng *rng, int update, int
     out->distance = (float)distance;
     out->cosine = (float)cosine;
     return 1;
+}
+
+/* Places with their normals, directions of late training samples there, and numbers in [0,1)^2, to ask a guide with. */
+static inline void sf1_queries(uint64_t seed, int count, float (*position)[3], float (*normal)[3], float (*given)[3],
+                               float (*u)[2])
+{
+    sf1_rng rng = {seed};
+    for (int i = 0; i < count;) {
+        sf1_sample s;
+        if (!sf1_draw(&sf1_default, &rng, 4, 0, &s))
+            continue;
+        memcpy(position[i], s.position, sizeof position[i]);
+        memcpy(normal[i], s.normal, sizeof normal[i]);
+        memcpy(given[i], s.direction, sizeof given[i]);
+        u[i][0] = (float)(0.999999 * sf1_uniform(&rng));
+        u[i++][1] = (float)(0.999999 * sf1_uniform(&rng));
+    }
 }
 
 /* ---- >>score ------------------------------------------------------------------------------------------------ */
