@@ -1,10 +1,11 @@
 /* test_render.c: the integrator against the outside: analytic irradiance and furnaces, three estimators that must
    agree, guided against unguided, and bit-identical images for any number of threads.
 
-     >>tools >>analytic >>agree >>guided >>splitting >>identical >>misuse */
+     >>tools >>analytic >>agree >>guided >>splitting >>trend >>identical >>misuse */
 #include "cmocka_prelude.h"
+#include "integrator.h"
 #include "scale.h"
-#include "tracer.h"
+#include "threads.h"
 
 #include <stdlib.h>
 #include <string.h>
@@ -483,6 +484,120 @@ static void splitting_changes_no_mean(void **state)
     tr_scene_free(scene);
 }
 
+/* ---- >>trend ------------------------------------------------------------------------------------------------ */
+
+/* Passes that grow by a quarter, variances N^-b, every other one times 1 + scatter. */
+static tr_trend trend_of(int passes, double b, double scatter)
+{
+    tr_trend t = {.count = 0};
+    double learned = 8;
+    for (int i = 0; i < passes; ++i, learned *= 1.25)
+        tr_trend_add(&t, learned, 3 * pow(learned, -b) * (i % 2 ? 1 + scatter : 1));
+    return t;
+}
+
+/* With V ~ N^-0.2 and 30 % of a pass for learning it pays while left > 1.5 spent. */
+static void learning_pays_by_the_trend(void **state)
+{
+    (void)state;
+    tr_trend t = trend_of(12, 0.2, 0);
+    assert_true(tr_learning_pays(&t, 10, 15.1, 0.3));
+    assert_false(tr_learning_pays(&t, 10, 14.9, 0.3));
+    assert_true(tr_learning_pays(&t, 10, 10.1, 0.2));
+    assert_false(tr_learning_pays(&t, 10, 9.9, 0.2));
+    t = trend_of(12, 0, 0); /* nothing to gain, but not before an eighth of the budget */
+    assert_false(tr_learning_pays(&t, 10, 69, 0.01));
+    assert_true(tr_learning_pays(&t, 10, 71, 0.99));
+    t = trend_of(12, 0, 1); /* variances that tell nothing */
+    assert_true(tr_learning_pays(&t, 10, 10, 0.2));
+    t = trend_of(12, -0.5, 0); /* light that is only being found */
+    assert_true(tr_learning_pays(&t, 10, 10, 0.3));
+    t = trend_of(4, 0, 0);
+    assert_true(tr_learning_pays(&t, 10, 10, 0.9));
+}
+
+/* It looks back to a third of the samples, to five passes at least, and past what is no number. */
+static void trend_looks_back_so_far(void **state)
+{
+    (void)state;
+    tr_trend flat = trend_of(5, 0, 0), steep = trend_of(40, 2, 0);
+    assert_int_equal(steep.count, TR_TREND_MAX);
+    for (int i = 0; i < 6; ++i) /* what was learned before is of no interest */
+        tr_trend_add(&steep, 1e6 * pow(1.25, i), 1);
+    assert_false(tr_learning_pays(&steep, 10, 10, 0.01));
+    tr_trend_add(&flat, NAN, 1);
+    tr_trend_add(&flat, 1, NAN);
+    tr_trend_add(&flat, 0, 1);
+    tr_trend_add(&flat, 30, -1);
+    assert_int_equal(flat.count, 5);
+    tr_trend doubling = {.count = 0};
+    for (int i = 0; i < 5; ++i)
+        tr_trend_add(&doubling, 1 << i, 1);
+    assert_false(tr_learning_pays(&doubling, 10, 10, 0.01));
+}
+
+/* A method that learns nothing and takes as long for it as the samples took. */
+static struct {
+    int taught, rested;
+    double start;
+} vain;
+static void *vain_create(tr_method_env *env, char *err, size_t err_size)
+{
+    memset(&vain, 0, sizeof vain);
+    vain.start = tr_cpu_seconds();
+    return (void)env, (void)err, (void)err_size, &vain;
+}
+static bool vain_begin(void *method, const tr_pass *pass)
+{
+    (void)method;
+    vain.taught += !pass->last;
+    vain.rested += pass->last;
+    return !pass->last;
+}
+static bool vain_end(void *method, const tr_pass *pass)
+{
+    double now = tr_cpu_seconds(), until = 2 * now - vain.start;
+    (void)method, (void)pass;
+    while (tr_cpu_seconds() < until)
+        continue;
+    vain.start = until;
+    return true;
+}
+static const tr_method vain_method = {.name = "vain",
+                                      .learns = true,
+                                      .create = vain_create,
+                                      .destroy = even_destroy,
+                                      .record = even_record,
+                                      .begin_pass = vain_begin,
+                                      .end_pass = vain_end};
+
+/* Half of every pass goes into learning that lowers no variance: a timed render stops that soon after the eighth of the
+   budget that teaches anyhow, one with a budget of samples goes on to its last pass. */
+static void learning_in_vain_stops(void **state)
+{
+    (void)state;
+    tr_scene *scene = load("cornell", NULL, NULL);
+    tr_settings s = small("pt", 0);
+    s.method = &vain_method;
+    s.width = 24;
+    s.height = 16;
+    s.max_depth = 3;
+    s.seconds = 3;
+    s.threads = 1;
+    tr_result timed = render(scene, &s);
+    print_message("%d passes taught, %.2f s, %d did not, %.2f s\n", vain.taught, timed.train_seconds, vain.rested,
+                  timed.cpu_seconds - timed.train_seconds);
+    assert_true(vain.taught >= 6 && vain.rested >= 2);
+    assert_true(timed.train_seconds < 2);
+    s.seconds = 0;
+    s.spp = 64;
+    tr_result counted = render(scene, &s);
+    assert_true(vain.taught >= 6 && vain.rested == 1);
+    tr_result_free(&timed);
+    tr_result_free(&counted);
+    tr_scene_free(scene);
+}
+
 /* ---- >>identical -------------------------------------------------------------------------------------------- */
 
 static void same_for_threads_with(const char *method, tr_option *options, int option_count, const char *scene_name,
@@ -624,6 +739,9 @@ int main(void)
         cmocka_unit_test(photons_agree_on_egg),
         cmocka_unit_test(splitting_changes_no_mean),
         cmocka_unit_test(trained_agrees_on_ajar),
+        cmocka_unit_test(learning_pays_by_the_trend),
+        cmocka_unit_test(trend_looks_back_so_far),
+        cmocka_unit_test(learning_in_vain_stops),
         cmocka_unit_test(pt_is_identical_for_any_threads),
         cmocka_unit_test(sdtree_is_identical_for_any_threads),
         cmocka_unit_test(photons_are_identical_for_any_threads),

@@ -87,6 +87,19 @@ typedef struct tr_counters {
 
 typedef struct tr_worker tr_worker;
 
+/* Variances of the latest passes, each with the samples per pixel that had been learned from before it. */
+#define TR_TREND_MAX 16
+typedef struct tr_trend {
+    int count;
+    double learned[TR_TREND_MAX], variance[TR_TREND_MAX];
+} tr_trend;
+
+/* Forgets the oldest when full. Nothing happens where either number is not positive. */
+void tr_trend_add(tr_trend *trend, double learned, double variance);
+/* Whether it pays to learn from the samples of the next pass: `spent` and `left` are CPU seconds of passes that taught
+   and of the rest of the budget, `share` is the share of a pass's time that learning takes. */
+bool tr_learning_pays(const tr_trend *trend, double spent, double left, double share);
+
 float tr_tan_half_fov_x(const tr_camera *camera, float aspect); /* aspect: width over height */
 
 tr_worker *tr_worker_create(const tr_frame *frame);

@@ -4,10 +4,12 @@
      >>rounds   a pass is cut into rounds of bounded memory; the method takes its records in after each
      >>combine  groups of passes, their variances and weights
      >>estimate the pixel estimate for variance-aware targets
+     >>trend    whether learning still pays
      >>loop     tr_render */
 #include "integrator.h"
 #include "threads.h"
 
+#include <math.h>
 #include <pthread.h>
 #include <stdlib.h>
 #include <string.h>
@@ -22,7 +24,7 @@ typedef struct group {
     double *sum, *sum_squares;
     int spp, first_spp; /* first_spp: samples of the image when it began, >= 1 */
     bool guided;
-    double variance; /* per sample, relative, trimmed mean over pixels */
+    double variance; /* of a sample, relative, trimmed mean over pixels */
     double weight;
 } group;
 
@@ -42,6 +44,11 @@ typedef struct render_state {
     tr_photon_stats photons;
     uint64_t round_tile; /* first tile of the round */
     bool guided;         /* the last pass met cells that guide */
+    tr_trend trend;      /* of a timed render */
+    int learned;         /* samples per pixel that were learned from */
+    double learning_cpu; /* CPU seconds of the passes that taught */
+    double learning;     /* share of the last such pass that recording, updating and photons took */
+    double rest;         /* variance of a sample when learning stopped to pay, 0 = it goes on */
     bool frozen;         /* after the training: one pass that teaches nothing */
     int done;            /* samples per pixel so far, those of the training too */
     double cost;         /* CPU seconds of a sample per pixel in the last pass */
@@ -156,10 +163,10 @@ static void select_smallest(double *value, size_t n, size_t keep)
 
 /* Mean over pixels of the per-sample variance over (estimate^2 + floor^2), without the worst 0.1 % of pixels: the
    error measure's own scale. Negative = too few samples to tell. */
-static double relative_variance(const render_state *r, const group *g)
+static double relative_variance(const render_state *r, const double *sums, const double *sum_squares, int spp)
 {
     size_t n = pixel_count(r);
-    if (g->spp < 2)
+    if (spp < 2)
         return -1;
     double *value = malloc(n * sizeof *value), mean = 0;
     if (!value)
@@ -171,7 +178,7 @@ static double relative_variance(const render_state *r, const group *g)
     for (size_t i = 0; i < n; ++i) {
         value[i] = 0;
         for (size_t c = 3 * i; c < 3 * i + 3; ++c) {
-            double m = g->sum[c] / g->spp, v = (g->sum_squares[c] / g->spp - m * m) * g->spp / (g->spp - 1.0);
+            double m = sums[c] / spp, v = (sum_squares[c] / spp - m * m) * spp / (spp - 1.0);
             value[i] += (v > 0 ? v : 0) / ((double)r->estimate.data[c] * r->estimate.data[c] + floor2) / 3;
         }
     }
@@ -193,7 +200,7 @@ static void weigh_groups(render_state *r)
     bool any = false;
     for (int i = r->group_count - 1; i >= 0; --i) {
         group *g = &r->groups[i];
-        g->variance = relative_variance(r, g);
+        g->variance = relative_variance(r, g->sum, g->sum_squares, g->spp);
         g->weight = 0;
         if (g->spp < 1 || (g->variance < 0 && r->group_count > 1))
             continue;
@@ -277,6 +284,106 @@ static bool estimate_pixels(render_state *r)
     /* The error measure divides by sqrt(R^2 + 0.1^2) with mean(R) = 0.5: the same floor here. */
     r->frame.estimate_floor = mean > 0 ? (float)(0.2 * mean) : 1;
     return true;
+}
+
+/* ---- >>trend ------------------------------------------------------------------------------------------------
+
+   Let a sample's variance fall like N^-b with the samples N that were learned from, and let learning take the share c
+   of a pass's time. Teaching for a moment dt more lowers the variance of all that is left by b dt / spent, and loses c
+   dt of the samples: it pays while b left / spent > c. */
+
+#define TREND_LEAST 5   /* passes that make a trend */
+#define TREND_SPAN 3    /* it looks back to a third of the samples, or to those passes */
+#define TREND_SOONEST 8 /* at least that share of the budget teaches */
+#define TREND_RISE 1.5  /* of variance, at which a field that rests has met new light */
+
+void tr_trend_add(tr_trend *t, double learned, double variance)
+{
+    if (!(learned > 0) || !(variance > 0))
+        return;
+    if (t->count == TR_TREND_MAX) {
+        t->count--;
+        memmove(t->learned, t->learned + 1, (size_t)t->count * sizeof *t->learned);
+        memmove(t->variance, t->variance + 1, (size_t)t->count * sizeof *t->variance);
+    }
+    t->learned[t->count] = learned;
+    t->variance[t->count++] = variance;
+}
+
+/* The trend's b: slope of the line through the logarithms, and its standard error. False = too few passes. A variance
+   that rises is one of rare light, which is only being found: it tells as little as one that scatters. */
+static bool trend_slope(const tr_trend *t, double *slope, double *error)
+{
+    double x[TR_TREND_MAX], y[TR_TREND_MAX], mx = 0, my = 0, xx = 0, xy = 0, yy = 0;
+    int n = 0;
+    for (int i = t->count; i-- > 0 && (n < TREND_LEAST || t->learned[i] * TREND_SPAN >= t->learned[t->count - 1]);
+         ++n) {
+        mx += x[n] = log(t->learned[i]);
+        my += y[n] = log(t->variance[i]);
+    }
+    for (int i = 0; i < n; ++i) {
+        double dx = x[i] - mx / n, dy = y[i] - my / n;
+        xx += dx * dx;
+        xy += dx * dy;
+        yy += dy * dy;
+    }
+    if (n < TREND_LEAST || !(xx > 0))
+        return false;
+    *slope = xy / xx;
+    *error = sqrt(fmax(0, yy - xy * *slope) / ((n - 2) * xx));
+    return true;
+}
+
+bool tr_learning_pays(const tr_trend *t, double spent, double left, double share)
+{
+    double slope, error;
+    if (spent * (TREND_SOONEST - 1) < left || !trend_slope(t, &slope, &error))
+        return true;
+    return (fabs(slope) + error) * left > share * spent;
+}
+
+/* What has been spent so far, in all and on learning; workers count wall-clock seconds. */
+typedef struct pass_clock {
+    double cpu, update, photon, workers, record;
+} pass_clock;
+
+static pass_clock read_clock(const render_state *r)
+{
+    pass_clock t = {.cpu = cpu_used(r), .update = r->update_cpu, .photon = r->photon_cpu};
+    for (int i = 0; i < r->worker_count; ++i) {
+        const tr_counters *c = tr_worker_counters(r->workers[i]);
+        t.workers += c->total;
+        t.record += c->record;
+    }
+    return t;
+}
+
+/* Decide whether the next pass of a timed render teaches. */
+static bool pass_teaches(render_state *r)
+{
+    const tr_settings *s = r->settings;
+    if (!s->method->learns || s->train > 0 || s->seconds <= 0)
+        return true;
+    if (r->rest <= 0 && !tr_learning_pays(&r->trend, r->learning_cpu, s->seconds - cpu_used(r), r->learning))
+        r->rest = r->trend.variance[r->trend.count - 1];
+    return r->rest <= 0;
+}
+
+/* What a pass tells about the next: the variance of its samples, and how much of its time learning from them took. */
+static void watch_pass(render_state *r, const pass_clock *before, double variance, bool taught)
+{
+    pass_clock now = read_clock(r);
+    double cpu = now.cpu - before->cpu, workers = now.workers - before->workers;
+    double update = now.update - before->update + now.photon - before->photon;
+    if (taught && cpu > 0) {
+        double record = workers > 0 ? (now.record - before->record) / workers * fmax(0, cpu - update) : 0;
+        tr_trend_add(&r->trend, r->learned, variance);
+        r->learning = (update + record) / cpu;
+        r->learning_cpu += cpu;
+    } else if (r->rest > 0 && variance > TREND_RISE * r->rest) {
+        r->rest = 0;
+        r->trend.count = 0;
+    }
 }
 
 /* ---- >>loop ------------------------------------------------------------------------------------------------- */
@@ -488,21 +595,25 @@ static bool next_pass(render_state *r, int limit)
     tr_pass info = {.index = pass, .budget = share_done(r)};
     info.spp = plan_pass(r, limit, &info.last);
     info.freezes = training && info.last;
-    info.last = !training && info.last;
-    double cpu = cpu_used(r);
+    info.last = !training && (info.last || !pass_teaches(r));
+    bool teaches = !info.last;
+    pass_clock before = read_clock(r);
     uint64_t guided_before = total_guided(r);
     r->frame.record = m->begin_pass ? m->begin_pass(r->frame.method_data, &info) : m->record != NULL;
     r->frame.guiding = m->find && !(m->idle && m->idle(r->frame.method_data));
     r->frame.estimate = m->wants_pixel_estimate && pass > 0 ? &r->estimate : NULL;
     info.spp = run_pass(r, pass, info.spp);
-    r->cost = (cpu_used(r) - cpu) / info.spp;
+    r->cost = (cpu_used(r) - before.cpu) / info.spp;
     r->guided = total_guided(r) > guided_before;
+    double variance = relative_variance(r, r->frame.sum, r->frame.sum_squares, info.spp);
     bool ok = close_pass(r, r->done - info.spp, info.spp, r->guided);
     if (ok && !info.last && !r->out_of_time)
         ok = shoot_photons(r, &info) && learn(r, &info);
+    watch_pass(r, &before, variance, teaches);
+    r->learned += teaches ? info.spp : 0;
     res->pass[pass].spp = info.spp;
-    res->pass[pass].cpu_seconds = cpu_used(r) - cpu;
-    res->pass[pass].variance = r->groups[r->group_count - 1].variance;
+    res->pass[pass].cpu_seconds = cpu_used(r) - before.cpu;
+    res->pass[pass].variance = variance;
     return ok;
 }
 

@@ -540,7 +540,7 @@ typedef struct tr_method_env {
 
 typedef struct tr_pass {
     int index, spp;
-    bool last;    /* nothing after it will use what it records */
+    bool last;    /* nothing is to be learned from it: the last one, or one after which learning would not pay */
     bool freezes; /* the training ends with it: what is learned now is what the picture is made with */
     float budget; /* share of the budget spent before this pass, 0 .. 1 */
 } tr_pass;
