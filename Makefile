@@ -37,9 +37,9 @@ AR ?= ar
 
 release_FLAGS := -O3 -DNDEBUG
 debug_FLAGS := -O0 -g
-scalar_FLAGS := -O2 -g -DGSD_NO_SIMD -DGKD_NO_SIMD -DGNN_NO_SIMD
-sanitize_FLAGS := -O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=undefined
-tsan_FLAGS := -O1 -g -fno-omit-frame-pointer -fsanitize=thread
+scalar_FLAGS := -O2 -g1 -DGSD_NO_SIMD -DGKD_NO_SIMD -DGNN_NO_SIMD
+sanitize_FLAGS := -O1 -g1 -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=undefined
+tsan_FLAGS := -O1 -g1 -fno-omit-frame-pointer -fsanitize=thread
 coverage_FLAGS := -O0 -g --coverage
 ifeq ($($(config)_FLAGS),)
 $(error config=$(config) is unknown: use release, debug, scalar, sanitize, tsan or coverage)

@@ -102,13 +102,18 @@ wanted() { # a script; filters are for the programs
     if [ -n "${TESTS-}" ]; then case " $TESTS " in *" $1 "*) true ;; *) false ;; esac; else [ -z "${TEST_FILTER-}" ]; fi
 }
 
-# What runs, longest first. The matrix compiles the headers by itself: once is enough, not once per configuration.
+# What runs. The matrix compiles the headers by itself: once is enough, not once per configuration.
 names=() commands=()
 plan() { names+=("$1") commands+=("$2"); }
 if [ "$CONFIG" = release ] && wanted matrix; then plan matrix 'bash tests/compile-matrix.sh'; fi
 if [ -x "$BUILD/render" ] && wanted cli; then plan cli 'bash tests/run-cli.sh'; fi
 for program in "$@"; do plan "$(basename "$program")" "$program"; done
 if [ "$CONFIG" = release ] && wanted uninitialised; then plan uninitialised 'bash tests/uninitialised.sh'; fi
+# Longest first, as tests/expected-count lists them, so that none is left alone at the end; before them what is new there.
+order=$(for i in "${!names[@]}"; do echo "$(sed -n "/^${names[i]} /=" tests/expected-count) $i"; done | sort -t ' ' -k 1,1n | sed 's/.* //')
+by_name=() by_command=()
+for i in $order; do by_name+=("${names[i]}") by_command+=("${commands[i]}"); done
+names=("${by_name[@]}") commands=("${by_command[@]}")
 
 # say COMMAND...: when no other worker prints.
 say() {
@@ -152,7 +157,7 @@ done
 
 if [ -n "${RECORD-}" ]; then
     {
-        echo "# How many tests each program has at least; rewritten by: make expected-count"
+        echo "# How many tests each program has at least, in the order they are run; rewritten by: make expected-count"
         printf '%s' "$recorded"
     } >tests/expected-count
 elif [ -z "${TESTS-}${TEST_FILTER-}" ] && [ -e tests/expected-count ]; then

@@ -24,11 +24,12 @@ amount="$SECONDS_ALL seconds"
 printf 'config %s, seed %s, %s\n' "$CONFIG" "$SEED" "$amount"
 printf '%-8s %-20s %9s %9s %9s %6s %9s %7s %6s\n' header group tried refused survived lost faults seconds MB
 failed=0
-for program in "$@"; do
-    "$program" --rows --seconds "$each" --seed "$SEED" ${CASES:+--cases "$CASES"} ${ONLY:+--only "$ONLY"} | tee -a "$rows"
-    status=${PIPESTATUS[0]}
-    [ "$status" = 0 ] || [ "$status" = 3 ] || failed=1 # 3: has no group ONLY
-done
+# Numbers of cases do not depend on what else runs: several programs at a time. Each row is written at once.
+jobs=1
+[ -z "${CASES-}" ] || jobs=$(nproc 2>/dev/null || echo 2)
+printf '%s\0' "$@" | xargs -0 -P "$jobs" -I '{}' bash -c '"$@"; status=$?; [ $status = 0 ] || [ $status = 3 ]' stress \
+    '{}' --rows --seconds "$each" --seed "$SEED" ${CASES:+--cases "$CASES"} ${ONLY:+--only "$ONLY"} | tee "$rows"
+[ "${PIPESTATUS[1]}" = 0 ] || failed=1 # 3: has no group ONLY
 awk '{ t += $3; r += $4; s += $5; l += $6 } END {
     printf "%-8s %-20s %9d %9d %9d %6d\n", "all", NR " groups", t, r, s, l; exit NR == 0 || l > 0 }' "$rows" || failed=1
 exit $failed
