@@ -4,7 +4,8 @@
    repair=none|gaussian|pyramid|pull_push, sigma (bins), pyramid_levels, rows=16|32|64, grid (cubes along the longest
    side of the scene), c (photons before a voxel splits), max_levels, keep_passes, max_memory_mb,
    learn_alpha=ratio|variance|off (on = variance), alpha, gate=on|off, gate_margin, gate_probe, uniform, surface=on|off
-   (what lies below the surface is mirrored up), jitter=on|off (find looks up a jittered position).
+   (what lies below the surface is mirrored up), jitter=on|off (find looks up a jittered position), parallax=on|off
+   (off: photons do not tell their distances).
 
    A pass's photons are traced after its camera paths, which make voxels valid, also those that the refine before has
    cut. They start where earlier ones came to valid voxels (emission=on|off). How many there are follows from counted
@@ -41,7 +42,7 @@ typedef struct photon {
     gph_view view;
     gph_stream **streams; /* of camera paths; those of photons follow */
     int tiles, photon_tiles;
-    bool surface, jitter, adapts;
+    bool surface, jitter, adapts, parallax;
     tr_emission_map *emission; /* NULL: even emission */
     double per_path, paths;    /* photon paths per camera path; camera paths of one sample per pixel */
     photon_budget budget;
@@ -80,6 +81,7 @@ static bool parse(parser *p, gph_desc *d, photon *m)
     d->gate_probe = whole(p, "gate_probe", 0);
     m->surface = choice(p, "surface", "off|on") != 0;
     m->jitter = choice(p, "jitter", "off|on") == 1;
+    m->parallax = choice(p, "parallax", "off|on") != 0;
     if (p->ok && learns_emission && !(m->emission = tr_emission_map_create(m->photon_tiles))) {
         snprintf(p->err, p->err_size, "photon: out of memory");
         return false;
@@ -269,7 +271,7 @@ static bool photon_record_photons(void *method, int tile, const tr_photon *photo
                 ok = tr_emission_map_record(m->emission, tile, p->u, p->density, (float)(1 / (known + FEW_PHOTONS))) &&
                      ok;
             memcpy(from, &p->wi, sizeof from);
-            samples[k++] = gph_make_photon(at, from, p->distance,
+            samples[k++] = gph_make_photon(at, from, m->parallax ? p->distance : INFINITY,
                                            (float)((double)((p->flux.x + p->flux.y + p->flux.z) / 3) * m->flux));
         }
         ok = !gph_record_photons(m->streams[m->tiles + tile], samples, (uint32_t)k) && ok;
