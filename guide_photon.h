@@ -99,6 +99,7 @@
      gph_vertex: one per non-delta vertex of a camera path, also where the field is not asked: it makes its voxel valid.
      contribution: mean over channels of f L cos, L as in the other headers: radiance from the sampled direction, not
      divided by a density. Zeros count. pdf_guide = 0: not evaluated. GPH_TOUCH_ONLY: only the position counts.
+     sides: on which side its surface was met, so that gph_takes_photons can tell what of a thin wall nobody sees.
      gph_photon: one per hit of a photon on a non-delta surface. direction: to where it came from. flux: mean over
      channels of its path's power, W; not divided by the number of paths of the pass, so that paths of all passes count
      alike. distance: that it flew since the last non-delta surface or its light; INFINITY: from the environment or a
@@ -236,9 +237,11 @@ typedef struct gph_vertex {
     float pdf_mix;      /* what the direction was drawn with */
     float pdf_bsdf;
     float pdf_guide; /* 0 = not evaluated */
-    uint32_t strategy;
+    uint16_t strategy;
+    uint16_t sides; /* gph_sides of the normal towards wo; 0 = all */
 } gph_vertex;
 enum { GPH_FROM_BSDF, GPH_FROM_GUIDE, GPH_TOUCH_ONLY };
+#define GPH_ALL_SIDES 63u
 
 /* A hit of a photon. 32 bytes; see THE SAMPLES. Filled by gph_make_photon. */
 typedef struct gph_photon {
@@ -369,11 +372,18 @@ GPH_API gph_result gph_refine(gph_field *field, gph_parallel_fn parallel, void *
 
 /* True when no voxel guides: a renderer may skip every query until the next refine. [any thread] */
 GPH_API bool gph_all_closed(const gph_field *field);
-/* True where a photon at this position would be kept in this pass; to end photon paths early. [any thread] */
-GPH_API bool gph_takes_photons(const gph_field *field, const float position[3]);
+/* True where a photon at this position would be kept in this pass; to end photon paths early. normal (NULL = none): of
+   the surface, on the side that the photon came from; then false also where no camera path has met this side of
+   anything in the voxel: such photons should not be recorded, a thin wall's other side may be in the sun. [any thread]
+ */
+GPH_API bool gph_takes_photons(const gph_field *field, const float position[3], const float *normal);
 /* How many photons the voxel at this position has seen by the last accumulate, in the first pass 0 until its refine;
-   negative where it takes none. What another one would be worth there, to decide where to send them. [any thread] */
-GPH_API double gph_photons_at(const gph_field *field, const float position[3]);
+   negative where it takes none (gph_takes_photons). What another one would be worth there, to decide where to send
+   them. [any thread] */
+GPH_API double gph_photons_at(const gph_field *field, const float position[3], const float *normal);
+/* How many camera vertices the voxel at this position has met, those of earlier passes faded by half a pass; 0 where
+   there is none. How much it matters what is known there. [any thread] */
+GPH_API double gph_vertices_at(const gph_field *field, const float position[3]);
 
 GPH_API void gph_get_stats(const gph_field *field, gph_stats *stats); /* [any thread] */
 /* Check every index and sum of both parts: GPH_OK, GPH_CORRUPT or GPH_OUT_OF_MEMORY. [any thread] */
@@ -718,8 +728,18 @@ GPH_QUERY float gph_sample(const gph_handle *handle, const float u[2], float dir
     return gph_pdf(handle, direction);
 }
 
-/* A vertex from scalars. strategy: GPH_FROM_BSDF, GPH_FROM_GUIDE (which of them drew the direction), GPH_TOUCH_ONLY.
-   [any thread] */
+/* Sides of the axes that a surface with this normal (unit) shows to: bits of -x, +x, -y, ... Never two opposite ones.
+   All for NULL or zero, as where light passes through. [any thread] */
+GPH_QUERY uint32_t gph_sides(const float *normal)
+{
+    uint32_t sides = 0, k;
+    for (k = 0; normal && k < 3; ++k)
+        sides |= normal[k] > 0.4f ? 2u << 2 * k : normal[k] < -0.4f ? 1u << 2 * k : 0;
+    return sides ? sides : GPH_ALL_SIDES;
+}
+
+/* A vertex from scalars; its sides may be set then. strategy: GPH_FROM_BSDF, GPH_FROM_GUIDE (which of them drew the
+   direction), GPH_TOUCH_ONLY. [any thread] */
 GPH_QUERY gph_vertex gph_make_vertex(const float position[3], float contribution, float pdf_mix, float pdf_bsdf,
                                      float pdf_guide, uint32_t strategy)
 {
@@ -729,7 +749,8 @@ GPH_QUERY gph_vertex gph_make_vertex(const float position[3], float contribution
     v.pdf_mix = pdf_mix;
     v.pdf_bsdf = pdf_bsdf;
     v.pdf_guide = pdf_guide;
-    v.strategy = strategy;
+    v.strategy = (uint16_t)strategy;
+    v.sides = 0;
     return v;
 }
 
@@ -906,7 +927,7 @@ typedef struct gphi_state {
     uint32_t touched;    /* vertices in this pass */
     uint32_t unread;     /* passes without a vertex */
     uint32_t fresh;      /* photons since `map` was made, half of the parents' counted */
-    uint32_t valid;      /* takes photons */
+    uint32_t valid;      /* sides of surfaces that take photons, 0 = none */
     uint32_t form;       /* gphi_form */
     uint32_t entries;    /* of a list */
     uint32_t rolled;     /* pass whose photons `now` of the histogram holds */
@@ -1710,7 +1731,7 @@ static bool gphi_far(const gph_field *f, const float p[3])
 
 static bool gphi_vertex_ok(const gph_vertex *v)
 {
-    if (!gphi_position_ok(v->position) || v->strategy > GPH_TOUCH_ONLY)
+    if (!gphi_position_ok(v->position) || v->strategy > GPH_TOUCH_ONLY || v->sides > GPH_ALL_SIDES)
         return false;
     return v->strategy == GPH_TOUCH_ONLY ||
            (v->contribution >= 0 && v->contribution < GPHI_MAX_VALUE && v->pdf_mix > 0 && v->pdf_mix < INFINITY &&
@@ -1774,7 +1795,7 @@ static gph_result gphi_take_vertices(gphi_batch *b, gph_parallel_fn parallel, vo
     gphi_run(parallel, user, b->count, 1024, gphi_find_vertices, b);
     for (i = 0; i < b->count; ++i) {
         const float *position = gphi_batch_position(b, i);
-        uint32_t *voxel = &b->voxel[i];
+        uint32_t *voxel = &b->voxel[i], sides;
         bool denied = false;
         if (*voxel == GPHI_BAD) {
             f->stats.refused++;
@@ -1792,7 +1813,8 @@ static gph_result gphi_take_vertices(gphi_batch *b, gph_parallel_fn parallel, vo
         f->stats.vertices++;
         f->stats.clamped += gphi_far(f, position);
         f->voxels[*voxel].s.touched++;
-        f->voxels[*voxel].s.valid = 1;
+        sides = ((const gph_vertex *)b->samples[i])->sides;
+        f->voxels[*voxel].s.valid |= sides ? sides : GPH_ALL_SIDES;
     }
     if (!gphi_batch_sort(b)) {
         gphi_lose(b, &f->stats.vertices);
@@ -3038,7 +3060,7 @@ static void gphi_count(gph_field *f)
     f->guiding = 0;
     for (i = 0; i < f->voxel_count; ++i) {
         s->sparse += f->voxels[i].s.form == GPHI_FORM_SPARSE;
-        s->valid += f->voxels[i].s.valid;
+        s->valid += f->voxels[i].s.valid != 0;
     }
     for (i = 0; i < b->voxels; ++i) {
         const gph_voxel *v = &gphi_block_voxels(b)[i];
@@ -3087,15 +3109,22 @@ GPH_API gph_result gph_refine(gph_field *field, gph_parallel_fn parallel, void *
 
 GPH_API bool gph_all_closed(const gph_field *field) { return field->guiding == 0; }
 
-GPH_API double gph_photons_at(const gph_field *field, const float position[3])
+GPH_API double gph_photons_at(const gph_field *field, const float position[3], const float *normal)
 {
     uint32_t voxel = gphi_find(field, position);
-    return voxel != GPH_NONE && field->voxels[voxel].s.valid ? field->voxels[voxel].s.photons : -1;
+    return voxel != GPH_NONE && field->voxels[voxel].s.valid & gph_sides(normal) ? field->voxels[voxel].s.photons : -1;
 }
 
-GPH_API bool gph_takes_photons(const gph_field *field, const float position[3])
+GPH_API double gph_vertices_at(const gph_field *field, const float position[3])
 {
-    return gph_photons_at(field, position) >= 0;
+    uint32_t voxel = gphi_find(field, position);
+    const gphi_state *s = voxel != GPH_NONE ? &field->voxels[voxel].s : NULL;
+    return s ? s->held.q_bsdf + s->held.q_guide + (double)s->touched : 0;
+}
+
+GPH_API bool gph_takes_photons(const gph_field *field, const float position[3], const float *normal)
+{
+    return gph_photons_at(field, position, normal) >= 0;
 }
 
 GPH_API void gph_get_stats(const gph_field *field, gph_stats *stats)
@@ -3567,10 +3596,11 @@ static bool gphi_voxel_valid(const gph_field *f, const gphi_voxel *v)
 {
     uint32_t i, n = gphi_bins(v, f->bins), last = 0;
     if (!gphi_sums_valid(&v->s.now) || !gphi_sums_valid(&v->s.held) || !(v->s.photons >= 0 && v->s.photons < 1e30) ||
-        v->s.valid > 1 || v->s.rolled > f->stats.passes || (v->s.map != GPH_NONE && v->s.map >= f->block->maps) ||
-        v->s.changed > 3 || v->sigma > GPHI_SIGMAS || v->s.verdict > GPH_GATE_CLOSED ||
-        !gphi_within_float(v->s.alpha, 0.04f, 1) || !gphi_within_float(v->s.reflected, 0, 1e30f) ||
-        !gphi_within_float(v->s.chosen, 0, 1e30f) || !gphi_pivot_ok(v->s.pivot, v->s.nearness))
+        v->s.valid > GPH_ALL_SIDES || v->s.rolled > f->stats.passes ||
+        (v->s.map != GPH_NONE && v->s.map >= f->block->maps) || v->s.changed > 3 || v->sigma > GPHI_SIGMAS ||
+        v->s.verdict > GPH_GATE_CLOSED || !gphi_within_float(v->s.alpha, 0.04f, 1) ||
+        !gphi_within_float(v->s.reflected, 0, 1e30f) || !gphi_within_float(v->s.chosen, 0, 1e30f) ||
+        !gphi_pivot_ok(v->s.pivot, v->s.nearness))
         return false;
     for (i = 0; i < n; ++i) {
         gphi_bin b = gphi_get_bin(v, f->bins, i);

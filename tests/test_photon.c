@@ -405,6 +405,48 @@ static void test_sampling_is_monotone_in_u(void **state)
     gph_destroy(f);
 }
 
+/* Photons on the other side of a thin wall, which no camera path meets, are not asked for. */
+static void test_sides_that_nobody_sees_take_no_photons(void **state)
+{
+    (void)state;
+    gph_desc d = unit_cube();
+    const float p[3] = {0.1f, 0.1f, 0.1f}, up[3] = {0, 0, 1}, down[3] = {0, 0, -1}, slanted[3] = {0.6f, 0, 0.8f};
+    const float zero[3] = {0, 0, 0}, side[3] = {-1, 0, 0};
+    gph_field *f;
+    gph_vertex v = touch(p);
+    assert_true(gph_sides(NULL) == GPH_ALL_SIDES && gph_sides(zero) == GPH_ALL_SIDES);
+    seed(12);
+    for (int i = 0; i < 1000; ++i) {
+        float n[3], m[3];
+        random_direction(n);
+        for (int k = 0; k < 3; ++k)
+            m[k] = -n[k];
+        assert_true(gph_sides(n) != 0 && gph_sides(n) < GPH_ALL_SIDES && (gph_sides(n) & gph_sides(m)) == 0);
+    }
+    OK(gph_create(&d, &f));
+    v.sides = GPH_ALL_SIDES + 1;
+    learn(f, &v, 1, NULL, 0);
+    assert_true(stats_of(f).refused == 1 && !gph_takes_photons(f, p, NULL));
+    v.sides = (uint16_t)gph_sides(up);
+    learn(f, &v, 1, NULL, 0);
+    assert_true(gph_takes_photons(f, p, up) && gph_takes_photons(f, p, slanted) && gph_takes_photons(f, p, NULL));
+    assert_true(!gph_takes_photons(f, p, down) && gph_photons_at(f, p, down) < 0 && !gph_takes_photons(f, p, side));
+    OK(gph_validate(f));
+    assert_int_equal(gphi_find(f, p), 0);
+    v.sides = 0;
+    learn(f, &v, 1, NULL, 0);
+    OK(gph_refine(f, NULL, NULL));
+    assert_true(gph_takes_photons(f, p, down) && gph_takes_photons(f, p, side) && stats_of(f).valid == 1);
+    v = gph_make_vertex(p, 1, 1, 1, 1, GPH_FROM_BSDF);
+    for (int pass = 0; pass < 2; ++pass) {
+        learn(f, &v, 1, NULL, 0);
+        assert_true(gph_vertices_at(f, p) == (pass ? 2 : 1) && gph_vertices_at(f, up) == 0);
+        OK(gph_refine(f, NULL, NULL));
+    }
+    assert_true(gph_vertices_at(f, p) == 1.5);
+    gph_destroy(f);
+}
+
 static void test_a_known_distribution_is_recovered(void **state)
 {
     (void)state;
@@ -792,20 +834,21 @@ static void test_only_places_of_camera_paths_take_photons(void **state)
     OK(gph_create(&d, &f));
     learn(f, NULL, 0, q, 2); /* before any camera path: nobody reads them */
     assert_int_equal(stats_of(f).unread, 2);
-    assert_true(gph_photons_at(f, here) < 0 && gph_photons_at(f, there) < 0);
+    assert_true(gph_photons_at(f, here, NULL) < 0 && gph_photons_at(f, there, NULL) < 0);
     learn(f, &v, 1, q, 2);
-    assert_true(gph_photons_at(f, here) == 0 && gph_photons_at(f, there) < 0); /* they wait for the refine */
+    assert_true(gph_photons_at(f, here, NULL) == 0 &&
+                gph_photons_at(f, there, NULL) < 0); /* they wait for the refine */
     OK(gph_refine(f, NULL, NULL));
-    assert_true(gph_photons_at(f, here) == 1 && gph_photons_at(f, there) < 0);
+    assert_true(gph_photons_at(f, here, NULL) == 1 && gph_photons_at(f, there, NULL) < 0);
     gph_stats s = stats_of(f);
     assert_int_equal(s.photons, 1);
     assert_int_equal(s.unread, 3);
     assert_int_equal(s.voxels, 1);
     assert_int_equal(s.maps, 1);
     assert_int_equal(s.sparse, 1);
-    assert_true(gph_takes_photons(f, here) && !gph_takes_photons(f, there));
+    assert_true(gph_takes_photons(f, here, NULL) && !gph_takes_photons(f, there, NULL));
     learn(f, NULL, 0, q, 1);
-    assert_true(gph_photons_at(f, here) == 2); /* later passes count at once */
+    assert_true(gph_photons_at(f, here, NULL) == 2); /* later passes count at once */
     gph_destroy(f);
 }
 
@@ -920,7 +963,7 @@ static void test_later_passes_are_cut_in_the_middle_and_halves_inherit(void **st
     OK(gph_refine(f, NULL, NULL));
     assert_int_equal(stats_of(f).splits, 0);
     learn(f, &v, 1, q, N); /* 1800 > 1000 sqrt(1800 / 900) */
-    assert_true(gph_photons_at(f, p) == 2 * N && gph_photons_at(f, other) == 2 * N);
+    assert_true(gph_photons_at(f, p, NULL) == 2 * N && gph_photons_at(f, other, NULL) == 2 * N);
     gph_handle before = find(f, p);
     float density = gph_pdf(&before, w);
     OK(gph_refine(f, NULL, NULL));
@@ -931,11 +974,11 @@ static void test_later_passes_are_cut_in_the_middle_and_halves_inherit(void **st
     gph_handle low = find(f, p), high = find(f, other);
     assert_true(low.voxel != high.voxel);
     assert_true(gph_pdf(&low, w) == density && gph_pdf(&high, w) == density);
-    assert_false(gph_takes_photons(f, p)); /* until it is touched again */
-    assert_true(gph_photons_at(f, p) < 0 && gph_photons_at(f, other) < 0);
+    assert_false(gph_takes_photons(f, p, NULL)); /* until it is touched again */
+    assert_true(gph_photons_at(f, p, NULL) < 0 && gph_photons_at(f, other, NULL) < 0);
     learn(f, &v, 1, NULL, 0);
-    assert_true(gph_takes_photons(f, p) && !gph_takes_photons(f, other));
-    assert_true(gph_photons_at(f, p) == N && gph_photons_at(f, other) < 0); /* half of them */
+    assert_true(gph_takes_photons(f, p, NULL) && !gph_takes_photons(f, other, NULL));
+    assert_true(gph_photons_at(f, p, NULL) == N && gph_photons_at(f, other, NULL) < 0); /* half of them */
     gph_destroy(f);
 }
 
@@ -1598,7 +1641,7 @@ static void test_queries_do_not_allocate_and_lost_samples_are_counted(void **sta
     (void)stats_of(f);
     (void)gph_structure_id(f);
     (void)gph_save_bound(f);
-    (void)gph_takes_photons(f, p);
+    (void)gph_takes_photons(f, p, NULL);
     (void)gph_changed_voxels(f, voxel, 4);
     voxel[0] = 0;
     gph_export_maps(f, voxel, 1, x, NULL);
@@ -1828,6 +1871,7 @@ int main(void)
         cmocka_unit_test(test_samples_follow_the_density),
         cmocka_unit_test(test_samples_at_the_edges_of_bins_stay_inside),
         cmocka_unit_test(test_sampling_is_monotone_in_u),
+        cmocka_unit_test(test_sides_that_nobody_sees_take_no_photons),
         cmocka_unit_test(test_a_known_distribution_is_recovered),
         cmocka_unit_test(test_every_repair_helps_where_photons_are_few),
         cmocka_unit_test(test_the_blur_is_as_wide_as_the_light_allows),

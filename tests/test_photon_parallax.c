@@ -499,7 +499,7 @@ static void test_merged_voxels_see_the_lamp(void **state)
     OK(gph_merge(a, b, NULL, NULL));
     OK(gph_validate(a));
     OK(gph_refine(a, NULL, NULL));
-    assert_true(gph_photons_at(a, lamp) < 0 && a->voxels[0].s.photons == 3000);
+    assert_true(gph_photons_at(a, lamp, NULL) < 0 && a->voxels[0].s.photons == 3000);
     assert_true(score(a) < 200);
     print_message("merged: %.1f\n", score(a));
     gph_destroy(a);

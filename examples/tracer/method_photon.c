@@ -21,9 +21,9 @@
 #define IDLE_PASSES 4     /* between two passes with photons where they are of no use */
 #define WORK_SHARE 0.75   /* photons' part of the work, as camera paths' part is 1 */
 #define FIRST_WORK 4      /* of a photon path, before there was any */
-#define MIN_YIELD 0.001   /* photons that valid voxels take, per path: below it they are of no use ... */
+#define MIN_YIELD 0.0001  /* photons that valid voxels take, per path: below it they are of no use ... */
 #define PATIENCE 2        /* ... after so many passes */
-#define FEW_PHOTONS 32    /* in a voxel: the first ones say less than each is worth by 1 / M */
+#define FEW_PHOTONS 32    /* in a voxel: the first ones say less than each is worth by root(n) / M */
 #define PROBE_SHARE 0.125 /* of the paths, while they are of no use */
 
 /* What the last pass's photons cost and were good for; see >>budget. */
@@ -225,14 +225,20 @@ static const tr_emission_map *photon_emission(void *method) { return ((const pho
 
 /* ---- records */
 
+/* The side that a direction lies on. */
+static vec3 towards(vec3 normal, vec3 direction) { return dot3(normal, direction) < 0 ? neg3(normal) : normal; }
+
 static gph_vertex convert(const tr_vertex *v)
 {
     float p[3], contribution = v->cosine * (v->f.x * v->L.x + v->f.y * v->L.y + v->f.z * v->L.z) / 3;
     memcpy(p, &v->p, sizeof p);
     if (v->flags & TR_VERTEX_REJECTED)
         contribution = 0;
-    return gph_make_vertex(p, contribution, v->pdf_mix, v->pdf_bsdf, v->pdf_guide,
-                           v->flags & TR_VERTEX_GUIDED ? GPH_FROM_GUIDE : GPH_FROM_BSDF);
+    gph_vertex vertex = gph_make_vertex(p, contribution, v->pdf_mix, v->pdf_bsdf, v->pdf_guide,
+                                        v->flags & TR_VERTEX_GUIDED ? GPH_FROM_GUIDE : GPH_FROM_BSDF);
+    vec3 normal = towards(v->ng, v->wo);
+    vertex.sides = (uint16_t)gph_sides(v->flags & TR_VERTEX_PASSES ? NULL : &normal.x);
+    return vertex;
 }
 
 static bool photon_record(void *method, int tile, const tr_vertex *vertices, int n)
@@ -251,7 +257,8 @@ static bool photon_record(void *method, int tile, const tr_vertex *vertices, int
     return ok;
 }
 
-/* Those that next-event estimation finds anyhow, and those that no camera path can find, are of no use. */
+/* Those that next-event estimation finds anyhow, those that no camera path can find, and those that arrive where none
+   comes, as on a roof's outside, are of no use. */
 static bool photon_record_photons(void *method, int tile, const tr_photon *photons, int n)
 {
     photon *m = method;
@@ -262,14 +269,16 @@ static bool photon_record_photons(void *method, int tile, const tr_photon *photo
         int k = 0;
         for (; k < 64 && done < n; ++done) {
             const tr_photon *p = &photons[done];
+            const vec3 normal = towards(p->ng, p->wi);
             float at[3], from[3];
-            if (p->flags)
-                continue;
             memcpy(at, &p->p, sizeof at);
-            double known = m->emission ? gph_photons_at(m->field, at) : -1;
-            if (known >= 0)
-                ok = tr_emission_map_record(m->emission, tile, p->u, p->density, (float)(1 / (known + FEW_PHOTONS))) &&
-                     ok;
+            double known = p->flags ? -1 : gph_photons_at(m->field, at, &normal.x);
+            if (known < 0)
+                continue;
+            if (m->emission) {
+                double need = sqrt(gph_vertices_at(m->field, at)) / (known + FEW_PHOTONS);
+                ok = tr_emission_map_record(m->emission, tile, p->u, p->density, (float)need) && ok;
+            }
             memcpy(from, &p->wi, sizeof from);
             samples[k++] = gph_make_photon(at, from, m->parallax ? p->distance : INFINITY,
                                            (float)((double)((p->flux.x + p->flux.y + p->flux.z) / 3) * m->flux));
