@@ -40,7 +40,8 @@
      >>field     create, refine, stats         >>store   save, load, merge
      >>maps      features out, networks' maps in
      implementation:
-     >>memory  >>histogram  >>grid  >>streams  >>accumulate  >>cloud  >>gate  >>split  >>recycle  >>repair  >>weights
+     >>memory  >>histogram  >>grid  >>pivots  >>streams  >>accumulate  >>cloud  >>gate  >>split  >>recycle  >>repair
+   >>weights
      >>publish  >>refine  >>life  >>exchange  >>batches  >>files  >>licence
 
    HOW IT WORKS
@@ -56,6 +57,15 @@
      far (S_t) and of all but the last (S_t-1) both flux and photon numbers (P_t, P_t-1) are kept.
      Density of a direction: (1 - e) learned + e/(4 pi), e = 0.01 (desc.uniform); it integrates to 1. Directions are
      unit, world space, away from the surface towards the light.
+
+     Parallax: what is near is seen in another direction from each place of a voxel. A voxel's map lies on a sphere
+     around its pivot, the voxel's middle, on which directions from any place within are mapped to those from the pivot
+     and back, exactly (gph_to_pivot); the share e is even as seen from the pivot. 1 / radius is the mean of the
+   photons' 1 / distance, each weighted by the flux of the others in its bin: what is sharp decides, for which it
+   matters (a sun stays where it is, though more light comes from what is near); at most what keeps the voxel within 0.7
+   radii. The photons of the first pass are counted twice, so that their radius is known. Later a voxel changes its
+   pivot and radius only where its own ones would show light elsewhere by more than half a bin; what it has counted is
+   moved bin by bin. Places beyond 0.8 radii, which only jitter leads to, are taken for those at 0.8.
 
      What is learned is the histogram after desc.repair, the classical filters of Table 1 that need no network, or the
      map that gph_import_maps wrote in its place. The Gaussian's width is chosen for each map by what its photons say of
@@ -89,17 +99,19 @@
      gph_vertex: one per non-delta vertex of a camera path, also where the field is not asked: it makes its voxel valid.
      contribution: mean over channels of f L cos, L as in the other headers: radiance from the sampled direction, not
      divided by a density. Zeros count. pdf_guide = 0: not evaluated. GPH_TOUCH_ONLY: only the position counts.
+     sides: on which side its surface was met, so that gph_takes_photons can tell what of a thin wall nobody sees.
      gph_photon: one per hit of a photon on a non-delta surface. direction: to where it came from. flux: mean over
      channels of its path's power, W; not divided by the number of paths of the pass, so that paths of all passes count
-     alike. With next-event estimation leave out photons straight from a light that it samples.
+     alike. distance: that it flew since the last non-delta surface or its light; INFINITY: from the environment or a
+     sun. With next-event estimation leave out photons straight from a light that it samples.
      A pass's vertices go to accumulate before its photons or together with them: after a split they make halves valid.
 
    OPTIONS: see gph_desc. gph_resolve fills in defaults, gph_get_desc returns what a field uses.
 
    MEMORY
      n = bins (rows * rows * 2). Sampling part: 20 bytes per voxel, 3 n + 8 rows + 64 per map (1.58 times its
-     half-floats), 8 per node, 24 to 48 per cube. Building part: 360 bytes per voxel; its histogram is nothing while
-     empty, a list of 16 bytes per lit bin below 256 photons, 12 n bytes above. The first pass's photons wait in 24
+     half-floats), 8 per node, 24 to 48 per cube. Building part: 408 bytes per voxel; its histogram is nothing while
+     empty, a list of 16 bytes per lit bin below 256 photons, 12 n bytes above. The first pass's photons wait in 36
      bytes each, at most desc.cloud_photons. refine makes a new sampling part beside the old one, whose memory is kept
      for the next, from the second on with up to a quarter to spare: as far as all this together stays, between
      refines, within 8 times the half-floats of all maps, which it does not where most histograms are dense. max_bytes
@@ -143,7 +155,7 @@
 #include <stdint.h>
 #include <string.h>
 
-#define GPH_VERSION 2 /* of the saved format */
+#define GPH_VERSION 3 /* of the saved format */
 
 #ifndef GPH_API /* linkage of the functions; e.g. static */
 #define GPH_API extern
@@ -225,15 +237,18 @@ typedef struct gph_vertex {
     float pdf_mix;      /* what the direction was drawn with */
     float pdf_bsdf;
     float pdf_guide; /* 0 = not evaluated */
-    uint32_t strategy;
+    uint16_t strategy;
+    uint16_t sides; /* gph_sides of the normal towards wo; 0 = all */
 } gph_vertex;
 enum { GPH_FROM_BSDF, GPH_FROM_GUIDE, GPH_TOUCH_ONLY };
+#define GPH_ALL_SIDES 63u
 
-/* A hit of a photon. 28 bytes; see THE SAMPLES. Filled by gph_make_photon. */
+/* A hit of a photon. 32 bytes; see THE SAMPLES. Filled by gph_make_photon. */
 typedef struct gph_photon {
     float position[3];
     float direction[3]; /* to where it came from; any length */
-    float flux;         /* W; negative: will be refused */
+    float flux;         /* W */
+    float nearness;     /* 1 / distance it flew; 0 = infinitely far; negative: will be refused */
 } gph_photon;
 
 typedef void (*gph_range_fn)(void *context, uint32_t begin, uint32_t end);
@@ -300,8 +315,8 @@ typedef struct gph_node {
 #define GPH_LEAF 0x80000000u
 
 /* Pointers into one sampling part. Valid until the next exclusive call. A map: exact sums (64 bits, unit 2^-24) of the
-   weights before each row of constant z and of all (rows + 1 of them, then zeros up to 64 bytes), of the weights before
-   each 8 bins (bins / 8), then the weights, half-floats. */
+   weights before each row of constant z and of all (rows + 1 of them), four floats: its pivot and nearness, see
+   Parallax, zeros up to 64 bytes; sums of the weights before each 8 bins (bins / 8), then the weights, half-floats. */
 typedef struct gph_view {
     const uint64_t *keys;  /* hash table of cubes: mask + 1 slots, GPH_NO_KEY = free */
     const uint32_t *roots; /* beside the keys: node */
@@ -357,11 +372,18 @@ GPH_API gph_result gph_refine(gph_field *field, gph_parallel_fn parallel, void *
 
 /* True when no voxel guides: a renderer may skip every query until the next refine. [any thread] */
 GPH_API bool gph_all_closed(const gph_field *field);
-/* True where a photon at this position would be kept in this pass; to end photon paths early. [any thread] */
-GPH_API bool gph_takes_photons(const gph_field *field, const float position[3]);
+/* True where a photon at this position would be kept in this pass; to end photon paths early. normal (NULL = none): of
+   the surface, on the side that the photon came from; then false also where no camera path has met this side of
+   anything in the voxel: such photons should not be recorded, a thin wall's other side may be in the sun. [any thread]
+ */
+GPH_API bool gph_takes_photons(const gph_field *field, const float position[3], const float *normal);
 /* How many photons the voxel at this position has seen by the last accumulate, in the first pass 0 until its refine;
-   negative where it takes none. What another one would be worth there, to decide where to send them. [any thread] */
-GPH_API double gph_photons_at(const gph_field *field, const float position[3]);
+   negative where it takes none (gph_takes_photons). What another one would be worth there, to decide where to send
+   them. [any thread] */
+GPH_API double gph_photons_at(const gph_field *field, const float position[3], const float *normal);
+/* How many camera vertices the voxel at this position has met, those of earlier passes faded by half a pass; 0 where
+   there is none. How much it matters what is known there. [any thread] */
+GPH_API double gph_vertices_at(const gph_field *field, const float position[3]);
 
 GPH_API void gph_get_stats(const gph_field *field, gph_stats *stats); /* [any thread] */
 /* Check every index and sum of both parts: GPH_OK, GPH_CORRUPT or GPH_OUT_OF_MEMORY. [any thread] */
@@ -420,7 +442,7 @@ typedef struct gph_handle {
     uint32_t surface; /* 1: normal is one, directions below are mirrored up */
     float reflected;  /* mean of contribution / pdf_mix in the voxel: the radiance that its surfaces reflect, W/m^2/sr;
                          0 = not known. What a path can still bring here, for Russian roulette [Vorba 2016] */
-    uint32_t reserved;
+    float offset[3];  /* position relative to the map's pivot, in radii of its sphere; shorter than 1 */
 } gph_handle;
 
 #define GPH_PI 3.14159265358979324f
@@ -480,7 +502,57 @@ GPH_QUERY void gph_jitter(const gph_view *view, uint32_t voxel, const float posi
         out[k] = position[k] + (u[k] - 0.5f) * ldexpf(view->side, -((level + 2 - k) / 3));
 }
 
-/* Handle of a voxel (GPH_NONE is fine), without a normal. [any thread] */
+/* Position relative to a pivot in radii 1 / nearness of the sphere around it, pulled within GPH_MOST_OFFSET of it. */
+#define GPH_MOST_OFFSET 0.8f
+GPH_QUERY void gph_offset(const float pivot[3], float nearness, const float position[3], float offset[3])
+{
+    float x = (position[0] - pivot[0]) * nearness, y = (position[1] - pivot[1]) * nearness;
+    float z = (position[2] - pivot[2]) * nearness, l = x * x + y * y + z * z, f = 1;
+    if (!(l <= GPH_MOST_OFFSET * GPH_MOST_OFFSET)) {
+        f = l < 1e30f ? GPH_MOST_OFFSET / sqrtf(l) : 0;
+        x = l < 1e30f ? x : 0; /* what is not finite must not meet the 0 */
+        y = l < 1e30f ? y : 0;
+        z = l < 1e30f ? z : 0;
+    }
+    offset[0] = x * f;
+    offset[1] = y * f;
+    offset[2] = z * f;
+}
+
+/* Direction from the offset to that from the pivot to the same point of the sphere, o + t w. Returns solid angle there
+   per solid angle here: t^2 / s with s^2 = 1 - |o|^2 + (o . w)^2, t = s - o . w. Without offset nothing changes. */
+GPH_QUERY float gph_to_pivot(const float offset[3], const float direction[3], float out[3])
+{
+    float b, l, s, t;
+    if (!(offset[0] != 0 || offset[1] != 0 || offset[2] != 0)) { /* the rest would make NaN of infinity */
+        memcpy(out, direction, 3 * sizeof *out);
+        return 1;
+    }
+    b = (offset[0] * direction[0] + offset[1] * direction[1]) + offset[2] * direction[2];
+    l = (offset[0] * offset[0] + offset[1] * offset[1]) + offset[2] * offset[2];
+    s = sqrtf((1 - l) + b * b);
+    t = s - b;
+    out[0] = offset[0] + t * direction[0];
+    out[1] = offset[1] + t * direction[1];
+    out[2] = offset[2] + t * direction[2];
+    t = t * t / s;
+    return t < 8 ? t : 1; /* more only where the direction is not unit; NaN too */
+}
+
+/* The other way, in place: w - o, normalised. */
+GPH_QUERY void gph_from_pivot(const float offset[3], float direction[3])
+{
+    float x = direction[0] - offset[0], y = direction[1] - offset[1], z = direction[2] - offset[2], f;
+    if (!(offset[0] != 0 || offset[1] != 0 || offset[2] != 0))
+        return;
+    f = 1 / sqrtf((x * x + y * y) + z * z);
+    direction[0] = x * f;
+    direction[1] = y * f;
+    direction[2] = z * f;
+}
+
+/* Handle of a voxel (GPH_NONE is fine), without a normal, seen from its map's pivot (from elsewhere: gph_see_from).
+   [any thread] */
 GPH_QUERY void gph_set_voxel(const gph_view *view, uint32_t voxel, gph_handle *handle)
 {
     uint32_t map = voxel == GPH_NONE ? GPH_NONE : view->voxels[voxel].map, bins = view->rows * view->columns;
@@ -503,6 +575,15 @@ GPH_QUERY void gph_set_voxel(const gph_view *view, uint32_t voxel, gph_handle *h
     }
 }
 
+/* See a handle from a position: gph_find does it itself, this is for gph_set_voxel. [any thread] */
+GPH_QUERY void gph_see_from(gph_handle *handle, const float position[3])
+{
+    if (handle->weights) {
+        const float *pivot = (const float *)(const void *)(handle->sums + handle->rows + 1);
+        gph_offset(pivot, pivot[3], position, handle->offset);
+    }
+}
+
 /* Find what to sample from at a position. normal (NULL or zero = none, the full sphere): unit, on the side of the
    directions wanted. u (NULL = none): 3 random numbers for a stochastic lookup. [any thread] */
 GPH_QUERY void gph_find(const gph_view *view, const float position[3], const float *normal, const float *u,
@@ -516,6 +597,7 @@ GPH_QUERY void gph_find(const gph_view *view, const float position[3], const flo
         voxel = near != GPH_NONE && view->voxels[near].map != GPH_NONE ? near : voxel;
     }
     gph_set_voxel(view, voxel, handle);
+    gph_see_from(handle, position);
     if (normal && normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2] > 0.5f) {
         memcpy(handle->normal, normal, sizeof handle->normal);
         handle->surface = 1;
@@ -545,10 +627,12 @@ GPH_QUERY uint32_t gph_bin(uint32_t rows, uint32_t columns, const float directio
 
 GPH_QUERY float gph_pdf_sphere(const gph_handle *handle, const float direction[3])
 {
+    float seen[3], scale;
     if (!handle->weights)
         return GPH_UNIFORM_PDF;
-    return handle->scale * (float)gph_weight(handle->weights[gph_bin(handle->rows, handle->columns, direction)]) +
-           handle->uniform * GPH_UNIFORM_PDF;
+    scale = gph_to_pivot(handle->offset, direction, seen);
+    return scale * (handle->scale * (float)gph_weight(handle->weights[gph_bin(handle->rows, handle->columns, seen)]) +
+                    handle->uniform * GPH_UNIFORM_PDF);
 }
 
 /* Mirror about the surface. */
@@ -603,8 +687,8 @@ GPH_QUERY double gph_inside(double v)
     return v < 1 - 2e-5 ? v : 1 - 2e-5;
 }
 
-/* Direction (unit) from u in [0, 1)^2: z grows with u[0], and phi with u[1] where z stays in one row of bins (so before
-   mirroring). Returns the density of the direction after rounding. [any thread] */
+/* Direction (unit) from u in [0, 1)^2: as seen from the map's pivot z grows with u[0], and phi with u[1] where z stays
+   in one row of bins (so before mirroring). Returns the density of the direction after rounding. [any thread] */
 GPH_QUERY float gph_sample(const gph_handle *handle, const float u[2], float direction[3])
 {
     float z = 2 * u[0] - 1, phi = 2 * GPH_PI * u[1], r;
@@ -634,6 +718,7 @@ GPH_QUERY float gph_sample(const gph_handle *handle, const float u[2], float dir
     direction[0] = r * cosf(phi);
     direction[1] = r * sinf(phi);
     direction[2] = z;
+    gph_from_pivot(handle->offset, direction);
     if (handle->surface &&
         direction[0] * handle->normal[0] + direction[1] * handle->normal[1] + direction[2] * handle->normal[2] < 0) {
         float other[3];
@@ -643,8 +728,18 @@ GPH_QUERY float gph_sample(const gph_handle *handle, const float u[2], float dir
     return gph_pdf(handle, direction);
 }
 
-/* A vertex from scalars. strategy: GPH_FROM_BSDF, GPH_FROM_GUIDE (which of them drew the direction), GPH_TOUCH_ONLY.
-   [any thread] */
+/* Sides of the axes that a surface with this normal (unit) shows to: bits of -x, +x, -y, ... Never two opposite ones.
+   All for NULL or zero, as where light passes through. [any thread] */
+GPH_QUERY uint32_t gph_sides(const float *normal)
+{
+    uint32_t sides = 0, k;
+    for (k = 0; normal && k < 3; ++k)
+        sides |= normal[k] > 0.4f ? 2u << 2 * k : normal[k] < -0.4f ? 1u << 2 * k : 0;
+    return sides ? sides : GPH_ALL_SIDES;
+}
+
+/* A vertex from scalars; its sides may be set then. strategy: GPH_FROM_BSDF, GPH_FROM_GUIDE (which of them drew the
+   direction), GPH_TOUCH_ONLY. [any thread] */
 GPH_QUERY gph_vertex gph_make_vertex(const float position[3], float contribution, float pdf_mix, float pdf_bsdf,
                                      float pdf_guide, uint32_t strategy)
 {
@@ -654,7 +749,8 @@ GPH_QUERY gph_vertex gph_make_vertex(const float position[3], float contribution
     v.pdf_mix = pdf_mix;
     v.pdf_bsdf = pdf_bsdf;
     v.pdf_guide = pdf_guide;
-    v.strategy = strategy;
+    v.strategy = (uint16_t)strategy;
+    v.sides = 0;
     return v;
 }
 
@@ -665,7 +761,8 @@ GPH_QUERY gph_photon gph_make_photon(const float position[3], const float direct
     gph_photon p;
     memcpy(p.position, position, sizeof p.position);
     memcpy(p.direction, direction, sizeof p.direction);
-    p.flux = distance > 0 ? flux : -1; /* -1: will be refused, NaN too */
+    p.flux = flux;
+    p.nearness = distance > 0 ? 1 / distance : -1; /* -1: will be refused, NaN too */
     return p;
 }
 
@@ -734,7 +831,8 @@ GPH_API void gph_pdf_batch(const gph_view *view, uint32_t count, const uint32_t 
 #define GPHI_MIN_OPEN 4.0      /* for "pays" */
 #define GPHI_MIN_SEEN 32.0     /* vertices of a voxel, those of earlier passes faded, for its reflected radiance */
 #define GPHI_MAX_VOXELS (1u << 26)
-#define GPHI_GROUP 16u /* positions looked up together */
+#define GPHI_GROUP 16u      /* positions looked up together */
+#define GPHI_MOST_REACH 0.7 /* a voxel lies within so many radii of its pivot: the sphere is made larger for it */
 /* Instead of a voxel in a batch. */
 #define GPHI_BAD 0xfffffffeu
 #define GPHI_DARK 0xfffffffdu
@@ -814,6 +912,7 @@ typedef struct gphi_sums {
     double q_bsdf, l_bsdf;              /* number and contributions of what the BSDF drew [eq. 14] */
     double q_guide, l_guide;            /* and of what the guide drew */
     double flow;                        /* contributions / p of all these: what surfaces reflect */
+    double pairs, near_pairs;           /* of photons: flux times that of others in its bin; times 1 / distance */
     double v[GPHI_GATE], vv[GPHI_GATE]; /* sums of x_a = g^2 / (p p_a), and of x_a^2 */
     double cross[GPHI_GATE - 1];        /* of x_a x_1 */
 } gphi_sums;
@@ -828,7 +927,7 @@ typedef struct gphi_state {
     uint32_t touched;    /* vertices in this pass */
     uint32_t unread;     /* passes without a vertex */
     uint32_t fresh;      /* photons since `map` was made, half of the parents' counted */
-    uint32_t valid;      /* takes photons */
+    uint32_t valid;      /* sides of surfaces that take photons, 0 = none */
     uint32_t form;       /* gphi_form */
     uint32_t entries;    /* of a list */
     uint32_t rolled;     /* pass whose photons `now` of the histogram holds */
@@ -840,6 +939,8 @@ typedef struct gphi_state {
     float alpha;         /* learned */
     float reflected;     /* mean of contribution / p when there were enough vertices last, 0 = there were not yet */
     float chosen;        /* photons when the Gaussian's sigma was chosen; 0 = it is to be chosen */
+    float pivot[3];      /* where its histogram is seen from */
+    float nearness;      /* 1 / radius of the sphere around it on which the histogram lies; 0 = infinitely large */
 } gphi_state;
 
 /* A lit bin of a list, which is ordered by bin. */
@@ -926,9 +1027,10 @@ static uint32_t gphi_bins(const gphi_voxel *v, uint32_t bins)
 
 static float gphi_sum(float a, float b) { return a + b < GPHI_MAX_SUM ? a + b : GPHI_MAX_SUM; }
 
-/* So many photons to one bin; there is room. */
-static void gphi_add(gphi_voxel *v, uint32_t bins, uint32_t at, float flux, uint32_t count)
+/* So many photons to one bin; there is room. Returns the flux that was there before. */
+static float gphi_add(gphi_voxel *v, uint32_t bins, uint32_t at, float flux, uint32_t count)
 {
+    float before;
     gphi_bin b;
     uint32_t i = at;
     v->s.photons += count;
@@ -944,8 +1046,10 @@ static void gphi_add(gphi_voxel *v, uint32_t bins, uint32_t at, float flux, uint
         }
     }
     b = gphi_get_bin(v, bins, i);
+    before = *b.old + *b.now;
     *b.now = gphi_sum(*b.now, flux);
     *b.count_now = (uint16_t)(*b.count_now + count < 65535 ? *b.count_now + count : 65535);
+    return before;
 }
 
 /* A new pass begins: what was new is old now. Photon numbers keep their ratios where one outgrows 16 bits. */
@@ -1032,14 +1136,10 @@ typedef struct gphi_cube {
     uint32_t spare;
 } gphi_cube;
 
-/* A photon of the first pass. */
-typedef struct gphi_hit {
-    uint32_t voxel, bin;
-    float flux;
-} gphi_hit;
+/* A photon of the first pass. No padding: a save holds it as it is. */
 typedef struct gphi_cloud_photon {
-    float position[3];
-    gphi_hit hit;
+    gph_photon photon;
+    uint32_t voxel;
 } gphi_cloud_photon;
 
 /* The sampling part: this, then what the offsets say. */
@@ -1145,6 +1245,15 @@ static uint32_t gphi_find(const gph_field *f, const float position[3])
 {
     uint32_t node = gphi_find_leaf(f, position);
     return node == GPH_NONE ? GPH_NONE : f->nodes[node].link & ~GPH_LEAF;
+}
+
+static void gphi_cube_box(const gph_field *f, uint32_t cube, double low[3], double high[3])
+{
+    uint32_t k;
+    for (k = 0; k < 3; ++k) {
+        low[k] = f->origin[k] + f->side * ((double)(f->cubes[cube].key >> (21 * k) & 0x1fffffu) - 1048576.0);
+        high[k] = low[k] + f->side;
+    }
 }
 
 static void gphi_put_slot(gph_field *f, uint32_t cube)
@@ -1301,6 +1410,121 @@ static double gphi_threshold(const gph_field *f)
     return (double)f->desc.split_photons * sqrt(ratio > 1 ? ratio : 1);
 }
 
+/* ---- >>pivots ----------------------------------------------------------------------------------------------- */
+
+/* Bin that a bin's middle falls in, as seen from a pivot that lies at -shift, in radii of its sphere. */
+static uint32_t gphi_moved_bin(uint32_t rows, uint32_t bin, const float shift[3])
+{
+    uint32_t row = bin / (2 * rows), column = bin % (2 * rows);
+    float z = ((float)row + 0.5f) * 2 / (float)rows - 1, r = sqrtf(1 - z * z), d[3];
+    float phi = ((float)column + 0.5f) * GPH_PI / (float)rows;
+    d[0] = r * cosf(phi) + shift[0];
+    d[1] = r * sinf(phi) + shift[1];
+    d[2] = z + shift[2];
+    r = 1 / sqrtf(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
+    d[2] *= r;
+    return gph_bin(rows, 2 * rows, d);
+}
+
+/* Where one pivot's sphere lies from another pivot, in radii. */
+static void gphi_shift(const gphi_state *s, const float pivot[3], float shift[3])
+{
+    int k;
+    for (k = 0; k < 3; ++k)
+        shift[k] = (s->pivot[k] - pivot[k]) * s->nearness;
+}
+
+/* Move what a histogram holds to where another pivot sees it. Lit bins do not become more. */
+static void gphi_move_bins(gphi_voxel *v, uint32_t rows, const float pivot[3])
+{
+    float old[GPHI_MAX_BINS], now[GPHI_MAX_BINS], shift[3];
+    uint16_t count_old[GPHI_MAX_BINS], count_now[GPHI_MAX_BINS];
+    uint32_t bins = rows * rows * 2, i, n = gphi_bins(v, bins), entries = 0;
+    gphi_shift(&v->s, pivot, shift);
+    memset(old, 0, bins * sizeof *old);
+    memset(now, 0, bins * sizeof *now);
+    memset(count_old, 0, bins * sizeof *count_old);
+    memset(count_now, 0, bins * sizeof *count_now);
+    for (i = 0; i < n; ++i) {
+        gphi_bin b = gphi_get_bin(v, bins, i);
+        uint32_t at, sum_old, sum_now;
+        if (!(*b.old > 0 || *b.now > 0))
+            continue;
+        at = gphi_moved_bin(rows, b.at, shift);
+        sum_old = (uint32_t)count_old[at] + *b.count_old;
+        sum_now = (uint32_t)count_now[at] + *b.count_now;
+        old[at] = gphi_sum(old[at], *b.old);
+        now[at] = gphi_sum(now[at], *b.now);
+        count_old[at] = (uint16_t)(sum_old < 65535 ? sum_old : 65535);
+        count_now[at] = (uint16_t)(sum_now < 65535 ? sum_now : 65535);
+    }
+    for (i = 0; i < bins; ++i) {
+        bool list = v->s.form == GPHI_FORM_SPARSE;
+        gphi_bin b;
+        if (list && !(old[i] > 0 || now[i] > 0))
+            continue;
+        if (list)
+            ((gphi_entry *)v->data)[entries].bin = (uint16_t)i;
+        b = gphi_get_bin(v, bins, list ? entries++ : i);
+        *b.old = old[i];
+        *b.now = now[i];
+        *b.count_old = count_old[i];
+        *b.count_now = count_now[i];
+    }
+    v->s.entries = entries;
+}
+
+/* Where the photons to come of a voxel are seen from: see Parallax. Small changes are not worth the blur of moving. */
+static void gphi_choose_pivot(gphi_voxel *v, uint32_t rows, const double low[3], const double high[3])
+{
+    gphi_state *s = &v->s;
+    double radius = 0, pairs = s->held.pairs + s->now.pairs, nearness;
+    float pivot[3];
+    int k;
+    if (!(pairs > 0))
+        return;
+    for (k = 0; k < 3; ++k) {
+        radius += 0.25 * (high[k] - low[k]) * (high[k] - low[k]);
+        pivot[k] = (float)(0.5 * (low[k] + high[k]));
+    }
+    radius = sqrt(radius);
+    nearness = fmin((s->held.near_pairs + s->now.near_pairs) / pairs, GPHI_MOST_REACH / radius);
+    if (fabs(nearness - (double)s->nearness) * radius < 1.6 / rows)
+        return;
+    if (s->nearness > 0 && memcmp(pivot, s->pivot, sizeof pivot) != 0)
+        gphi_move_bins(v, rows, pivot);
+    memcpy(s->pivot, pivot, sizeof pivot);
+    s->nearness = (float)fmin(nearness, 1e30); /* a loaded field may be as small */
+    s->fresh = 0xffffffffu;                    /* its map is to be made anew */
+    s->chosen = 0;
+}
+
+/* Pivots of the voxels below a node. */
+static void gphi_place_below(gph_field *f, uint32_t node, const double low[3], const double high[3])
+{
+    uint32_t link = f->nodes[node].link, axis = link >> 29;
+    double to[3], from[3];
+    if (link & GPH_LEAF) {
+        gphi_choose_pivot(&f->voxels[link & ~GPH_LEAF], f->desc.rows, low, high);
+        return;
+    }
+    memcpy(to, high, sizeof to);
+    memcpy(from, low, sizeof from);
+    to[axis] = from[axis] = (double)f->nodes[node].split;
+    gphi_place_below(f, link & 0x1fffffffu, low, to);
+    gphi_place_below(f, (link & 0x1fffffffu) + 1, from, high);
+}
+
+static void gphi_place_all(gph_field *f)
+{
+    uint32_t i;
+    for (i = 0; i < f->cube_count; ++i) {
+        double low[3], high[3];
+        gphi_cube_box(f, i, low, high);
+        gphi_place_below(f, f->cubes[i].root, low, high);
+    }
+}
+
 /* ---- >>streams ---------------------------------------------------------------------------------------------- */
 
 typedef struct gphi_chunk {
@@ -1427,7 +1651,7 @@ static const double gphi_gate_alpha[GPHI_GATE] = {0.2, 0.45, 0.75, 1.0};
 typedef struct gphi_batch {
     gph_field *field;
     const void **samples;      /* each begins with its position */
-    gphi_hit *hits;            /* voxel: or GPH_NONE, GPHI_BAD, GPHI_DARK */
+    uint32_t *voxel;           /* or GPH_NONE, GPHI_BAD, GPHI_DARK */
     uint32_t *order, *offsets; /* samples by voxel; per voxel + 1 */
     uint32_t count;
 } gphi_batch;
@@ -1437,11 +1661,11 @@ static bool gphi_batch_make(gphi_batch *b, gph_field *f)
     memset(b, 0, sizeof *b);
     b->field = f;
     b->samples =
-        (const void **)gphi_allocate(&f->desc, GPHI_BATCH, sizeof *b->samples + sizeof *b->hits + sizeof *b->order);
+        (const void **)gphi_allocate(&f->desc, GPHI_BATCH, sizeof *b->samples + sizeof *b->voxel + sizeof *b->order);
     if (!b->samples)
         return false;
-    b->hits = (gphi_hit *)(void *)(b->samples + GPHI_BATCH);
-    b->order = (uint32_t *)(void *)(b->hits + GPHI_BATCH);
+    b->voxel = (uint32_t *)(void *)(b->samples + GPHI_BATCH);
+    b->order = b->voxel + GPHI_BATCH;
     return true;
 }
 
@@ -1458,16 +1682,16 @@ static bool gphi_batch_sort(gphi_batch *b)
     if (!b->offsets)
         return false;
     for (i = 0; i < b->count; ++i)
-        if (b->hits[i].voxel < f->voxel_count)
-            b->offsets[b->hits[i].voxel]++;
+        if (b->voxel[i] < f->voxel_count)
+            b->offsets[b->voxel[i]]++;
     for (i = 0; i <= f->voxel_count; ++i) {
         uint32_t n = b->offsets[i];
         b->offsets[i] = sum;
         sum += n;
     }
     for (i = 0; i < b->count; ++i)
-        if (b->hits[i].voxel < f->voxel_count)
-            b->order[b->offsets[b->hits[i].voxel]++] = i;
+        if (b->voxel[i] < f->voxel_count)
+            b->order[b->offsets[b->voxel[i]]++] = i;
     for (i = f->voxel_count; i > 0; --i) /* back to the beginnings */
         b->offsets[i] = b->offsets[i - 1];
     b->offsets[0] = 0;
@@ -1485,7 +1709,7 @@ static void gphi_lose(gphi_batch *b, uint64_t *accepted)
 {
     uint32_t i;
     for (i = 0; i < b->count; ++i)
-        if (b->hits[i].voxel < b->field->voxel_count) {
+        if (b->voxel[i] < b->field->voxel_count) {
             b->field->stats.lost++;
             --*accepted;
         }
@@ -1507,7 +1731,7 @@ static bool gphi_far(const gph_field *f, const float p[3])
 
 static bool gphi_vertex_ok(const gph_vertex *v)
 {
-    if (!gphi_position_ok(v->position) || v->strategy > GPH_TOUCH_ONLY)
+    if (!gphi_position_ok(v->position) || v->strategy > GPH_TOUCH_ONLY || v->sides > GPH_ALL_SIDES)
         return false;
     return v->strategy == GPH_TOUCH_ONLY ||
            (v->contribution >= 0 && v->contribution < GPHI_MAX_VALUE && v->pdf_mix > 0 && v->pdf_mix < INFINITY &&
@@ -1520,7 +1744,7 @@ static void gphi_find_vertices(void *context, uint32_t begin, uint32_t end)
     uint32_t i;
     for (i = begin; i < end; ++i) {
         const gph_vertex *v = (const gph_vertex *)b->samples[i];
-        b->hits[i].voxel = gphi_vertex_ok(v) ? gphi_find(b->field, v->position) : GPHI_BAD;
+        b->voxel[i] = gphi_vertex_ok(v) ? gphi_find(b->field, v->position) : GPHI_BAD;
     }
 }
 
@@ -1571,7 +1795,7 @@ static gph_result gphi_take_vertices(gphi_batch *b, gph_parallel_fn parallel, vo
     gphi_run(parallel, user, b->count, 1024, gphi_find_vertices, b);
     for (i = 0; i < b->count; ++i) {
         const float *position = gphi_batch_position(b, i);
-        uint32_t *voxel = &b->hits[i].voxel;
+        uint32_t *voxel = &b->voxel[i], sides;
         bool denied = false;
         if (*voxel == GPHI_BAD) {
             f->stats.refused++;
@@ -1589,7 +1813,8 @@ static gph_result gphi_take_vertices(gphi_batch *b, gph_parallel_fn parallel, vo
         f->stats.vertices++;
         f->stats.clamped += gphi_far(f, position);
         f->voxels[*voxel].s.touched++;
-        f->voxels[*voxel].s.valid = 1;
+        sides = ((const gph_vertex *)b->samples[i])->sides;
+        f->voxels[*voxel].s.valid |= sides ? sides : GPH_ALL_SIDES;
     }
     if (!gphi_batch_sort(b)) {
         gphi_lose(b, &f->stats.vertices);
@@ -1600,6 +1825,14 @@ static gph_result gphi_take_vertices(gphi_batch *b, gph_parallel_fn parallel, vo
     return result;
 }
 
+static bool gphi_photon_ok(const gph_photon *p)
+{
+    const float *d = p->direction;
+    float l = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
+    return l > 1e-12f && l < 1e12f && p->flux >= 0 && p->flux < GPHI_MAX_VALUE && p->nearness >= 0 &&
+           gphi_position_ok(p->position);
+}
+
 static void gphi_find_photons(void *context, uint32_t begin, uint32_t end)
 {
     gphi_batch *b = (gphi_batch *)context;
@@ -1607,24 +1840,24 @@ static void gphi_find_photons(void *context, uint32_t begin, uint32_t end)
     uint32_t i;
     for (i = begin; i < end; ++i) {
         const gph_photon *p = (const gph_photon *)b->samples[i];
-        gphi_hit *h = &b->hits[i];
-        float l =
-            p->direction[0] * p->direction[0] + p->direction[1] * p->direction[1] + p->direction[2] * p->direction[2];
-        if (!(l > 1e-12f && l < 1e12f) || !(p->flux >= 0 && p->flux < GPHI_MAX_VALUE) || !gphi_position_ok(p->position))
-            h->voxel = GPHI_BAD;
-        else if (p->flux > 0) {
-            float r = 1 / sqrtf(l), d[3];
-            d[0] = p->direction[0] * r;
-            d[1] = p->direction[1] * r;
-            d[2] = p->direction[2] * r;
-            h->voxel = gphi_find(f, p->position);
-            if (h->voxel != GPH_NONE && !f->voxels[h->voxel].s.valid)
-                h->voxel = GPH_NONE;
-            h->bin = gph_bin(f->desc.rows, 2 * f->desc.rows, d);
-            h->flux = p->flux;
-        } else
-            h->voxel = GPHI_DARK;
+        uint32_t *voxel = &b->voxel[i];
+        *voxel = !gphi_photon_ok(p) ? GPHI_BAD : p->flux > 0 ? gphi_find(f, p->position) : GPHI_DARK;
+        if (*voxel < f->voxel_count && !f->voxels[*voxel].s.valid)
+            *voxel = GPH_NONE;
     }
+}
+
+/* Bin of a photon as seen from the pivot of its voxel. */
+static uint32_t gphi_photon_bin(const gphi_state *s, uint32_t rows, const gph_photon *p)
+{
+    const float *w = p->direction;
+    float r = 1 / sqrtf(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]), d[3], offset[3], seen[3];
+    d[0] = w[0] * r;
+    d[1] = w[1] * r;
+    d[2] = w[2] * r;
+    gph_offset(s->pivot, s->nearness, p->position, offset);
+    gph_to_pivot(offset, d, seen);
+    return gph_bin(rows, 2 * rows, seen);
 }
 
 /* Room in the histogram of voxel i for `count` photons of a batch. */
@@ -1652,18 +1885,27 @@ static gph_result gphi_make_room(gph_field *f, uint32_t i, uint32_t count)
     return GPH_OK;
 }
 
+/* Add a photon to a histogram. What is nearer than a thousandth of the box counts as that. */
+static void gphi_add_photon(const gph_field *f, gphi_voxel *v, const gph_photon *p)
+{
+    double near = fmin(fmin((double)p->nearness, 1000 / (f->side * f->desc.grid_cells)), 1e30);
+    float others = gphi_add(v, f->bins, gphi_photon_bin(&v->s, f->desc.rows, p), p->flux, 1);
+    v->s.now.pairs += (double)p->flux * (double)others;
+    v->s.now.near_pairs += (double)p->flux * (double)others * near;
+}
+
 static void gphi_add_hits(void *context, uint32_t begin, uint32_t end)
 {
     gphi_batch *b = (gphi_batch *)context;
-    uint32_t i, k, bins = b->field->bins;
+    uint32_t i, k;
     for (i = begin; i < end; ++i) {
         gphi_voxel *v = &b->field->voxels[i];
         if (b->offsets[i] == b->offsets[i + 1] || v->s.blocked)
             continue;
-        gphi_roll(v, bins, b->field->stats.passes);
+        gphi_roll(v, b->field->bins, b->field->stats.passes);
         v->s.changed |= 1;
         for (k = b->offsets[i]; k < b->offsets[i + 1]; ++k)
-            gphi_add(v, bins, b->hits[b->order[k]].bin, b->hits[b->order[k]].flux, 1);
+            gphi_add_photon(b->field, v, (const gph_photon *)b->samples[b->order[k]]);
     }
 }
 
@@ -1705,9 +1947,9 @@ static bool gphi_join_cloud(gphi_batch *b)
         return false;
     f->cloud = cloud;
     for (i = 0; i < b->count; ++i)
-        if (b->hits[i].voxel < f->voxel_count) {
-            memcpy(cloud[f->cloud_count].position, b->samples[i], sizeof cloud->position);
-            cloud[f->cloud_count++].hit = b->hits[i];
+        if (b->voxel[i] < f->voxel_count) {
+            memcpy(&cloud[f->cloud_count].photon, b->samples[i], sizeof cloud->photon);
+            cloud[f->cloud_count++].voxel = b->voxel[i];
         }
     return true;
 }
@@ -1729,8 +1971,8 @@ static gph_result gphi_settle(gphi_batch *b, gph_parallel_fn parallel, void *use
         close = gphi_close_cloud(&other, parallel, user);
         gphi_batch_free(&other);
         for (i = 0; i < b->count; ++i) /* its voxel may have been cut */
-            if (b->hits[i].voxel < f->voxel_count)
-                b->hits[i].voxel = gphi_find(f, gphi_batch_position(b, i));
+            if (b->voxel[i] < f->voxel_count)
+                b->voxel[i] = gphi_find(f, gphi_batch_position(b, i));
     }
     result = gphi_take_hits(b, parallel, user);
     return result ? result : close;
@@ -1743,7 +1985,7 @@ static gph_result gphi_take_photons(gphi_batch *b, gph_parallel_fn parallel, voi
     uint32_t i;
     gphi_run(parallel, user, b->count, 1024, gphi_find_photons, b);
     for (i = 0; i < b->count; ++i) {
-        uint32_t voxel = b->hits[i].voxel;
+        uint32_t voxel = b->voxel[i];
         bool useful = voxel < f->voxel_count;
         f->stats.refused += voxel == GPHI_BAD;
         f->stats.dark += voxel == GPHI_DARK;
@@ -1880,7 +2122,7 @@ static bool gphi_median(const gphi_group *g, const uint32_t *photons, uint32_t c
     float least = INFINITY, median, next = INFINITY; /* next: smallest that is more than the least */
     uint32_t i;
     for (i = 0; i < count; ++i) {
-        g->numbers[i] = g->field->cloud[photons[i]].position[axis];
+        g->numbers[i] = g->field->cloud[photons[i]].photon.position[axis];
         least = g->numbers[i] < least ? g->numbers[i] : least;
     }
     for (i = 0; i < count; ++i)
@@ -1912,10 +2154,10 @@ static gph_result gphi_cut_group(gphi_group *g, uint32_t node, uint32_t *photons
     child = f->nodes[node].link & 0x1fffffffu;
     for (i = 0; i < count; ++i) {
         gphi_cloud_photon *p = &f->cloud[photons[i]];
-        if (p->position[axis] < split)
+        if (p->photon.position[axis] < split)
             photons[low++] = photons[i];
         else {
-            p->hit.voxel = f->voxel_count - 1;
+            p->voxel = f->voxel_count - 1;
             g->spare[high++] = photons[i];
         }
     }
@@ -1941,46 +2183,75 @@ static gph_result gphi_cut_cloud(gph_field *f)
     g.spare = (uint32_t *)(void *)(g.numbers + f->cloud_count);
     order = g.spare + f->cloud_count;
     for (i = 0; i < f->cloud_count; ++i)
-        offsets[f->cloud[i].hit.voxel + 1]++;
+        offsets[f->cloud[i].voxel + 1]++;
     for (i = 0; i < voxels; ++i)
         offsets[i + 1] += offsets[i];
     for (i = 0; i < f->cloud_count; ++i)
-        order[offsets[f->cloud[i].hit.voxel]++] = i;
+        order[offsets[f->cloud[i].voxel]++] = i;
     for (i = 0; i < voxels && !result; ++i) {
         uint32_t *photons = order + sum, count = offsets[i] - sum;
         sum = offsets[i];
         if (count)
-            result =
-                gphi_cut_group(&g, gphi_find_leaf(f, f->cloud[photons[0]].position), photons, count, GPHI_NEW_LEVELS);
+            result = gphi_cut_group(&g, gphi_find_leaf(f, f->cloud[photons[0]].photon.position), photons, count,
+                                    GPHI_NEW_LEVELS);
     }
     gphi_release(&f->desc, g.numbers);
     gphi_release(&f->desc, offsets);
     return result;
 }
 
-/* The first pass is over, or has too many photons to keep: median splits, then all of them go to histograms. Where the
-   splits find no memory, voxels stay as they are. */
-static gph_result gphi_close_cloud(gphi_batch *b, gph_parallel_fn parallel, void *user)
+/* All photons of the cloud to the histograms. */
+static gph_result gphi_add_cloud(gphi_batch *b, gph_parallel_fn parallel, void *user)
 {
     gph_field *f = b->field;
     gph_result result = GPH_OK;
-    gphi_cloud_photon *cloud;
-    uint32_t i, k, count;
-    f->cloud_closed = 1;
-    if (f->cloud_count)
-        result = gphi_cut_cloud(f);
-    cloud = f->cloud;
-    count = f->cloud_count;
-    for (i = 0; i < count; i += b->count) {
-        b->count = count - i < GPHI_BATCH ? count - i : GPHI_BATCH;
-        for (k = 0; k < b->count; ++k)
-            b->hits[k] = cloud[i + k].hit;
+    uint32_t i, k;
+    for (i = 0; i < f->cloud_count; i += b->count) {
+        b->count = f->cloud_count - i < GPHI_BATCH ? f->cloud_count - i : GPHI_BATCH;
+        for (k = 0; k < b->count; ++k) {
+            b->samples[k] = &f->cloud[i + k].photon;
+            b->voxel[k] = f->cloud[i + k].voxel;
+        }
         if (gphi_take_hits(b, parallel, user))
             result = GPH_OUT_OF_MEMORY;
     }
+    return result;
+}
+
+/* Take all photons out of the histograms, which keep their room. */
+static void gphi_empty_histograms(gph_field *f)
+{
+    uint32_t i;
+    for (i = 0; i < f->voxel_count; ++i) {
+        gphi_voxel *v = &f->voxels[i];
+        if (v->data)
+            memset(v->data, 0, gphi_data_bytes(v, f->bins));
+        v->s.entries = v->s.fresh = 0;
+        v->s.photons = v->s.now.pairs = v->s.now.near_pairs = 0;
+    }
+}
+
+/* The first pass is over, or has too many photons to keep: median splits, then all of them go to histograms, twice: the
+   first time tells where from they are to be seen. Where the splits find no memory, voxels stay as they are. */
+static gph_result gphi_close_cloud(gphi_batch *b, gph_parallel_fn parallel, void *user)
+{
+    gph_field *f = b->field;
+    gph_stats before;
+    gph_result result = GPH_OK;
+    f->cloud_closed = 1;
+    if (f->cloud_count)
+        result = gphi_cut_cloud(f);
+    before = f->stats;
+    if (gphi_add_cloud(b, parallel, user))
+        result = GPH_OUT_OF_MEMORY;
+    gphi_place_all(f);
+    gphi_empty_histograms(f);
+    f->stats = before; /* what found no room is counted once */
+    if (gphi_add_cloud(b, parallel, user))
+        result = GPH_OUT_OF_MEMORY;
+    gphi_release(&f->desc, f->cloud);
     f->cloud = NULL;
     f->cloud_count = f->cloud_capacity = 0;
-    gphi_release(&f->desc, cloud);
     return result;
 }
 
@@ -2170,15 +2441,12 @@ static gph_result gphi_split_below(gph_field *f, uint32_t node, const double low
 static gph_result gphi_split_all(gph_field *f)
 {
     gph_result result = GPH_OK;
-    uint32_t i, k, before = f->voxel_count;
+    uint32_t i, before = f->voxel_count;
     for (i = 0; i < before; ++i)
         f->voxels[i].s.blocked = f->voxels[i].s.level;
     for (i = 0; i < f->cube_count && !result; ++i) {
         double low[3], high[3];
-        for (k = 0; k < 3; ++k) {
-            low[k] = f->origin[k] + f->side * ((double)(f->cubes[i].key >> (21 * k) & 0x1fffffu) - 1048576.0);
-            high[k] = low[k] + f->side;
-        }
+        gphi_cube_box(f, i, low, high);
         result = gphi_split_below(f, f->cubes[i].root, low, high, GPHI_NEW_LEVELS);
     }
     for (i = 0; i < f->voxel_count; ++i) {
@@ -2529,8 +2797,12 @@ static bool gphi_sum_weights(unsigned char *map, uint32_t rows, bool compare)
     return (same || !compare) && sum > 0;
 }
 
-/* A map of values >= 0 as weights whose largest is 2^15, with their sums. False, and nothing written, without light. */
-static bool gphi_write_map(unsigned char *to, const float *map, uint32_t rows)
+/* Pivot and nearness. */
+static float *gphi_map_pivot(unsigned char *map, uint32_t rows) { return (float *)(void *)(map + (rows + 1) * 8); }
+
+/* A map of values >= 0 as weights whose largest is 2^15, with their sums, seen from the pivot of s. False, and nothing
+   written, without light. */
+static bool gphi_write_map(unsigned char *to, const float *map, uint32_t rows, const gphi_state *s)
 {
     uint16_t *weights = gphi_map_weights(to, rows);
     float most = 0;
@@ -2544,6 +2816,8 @@ static bool gphi_write_map(unsigned char *to, const float *map, uint32_t rows)
     for (i = 0; i < bins; ++i)
         weights[i] = map[i] > 0 ? gphi_half((float)((double)map[i] * scale)) : 0;
     memset(to + (rows + 1) * 8, 0, 56); /* between the sums of rows and of eights */
+    memcpy(gphi_map_pivot(to, rows), s->pivot, sizeof s->pivot);
+    gphi_map_pivot(to, rows)[3] = s->nearness;
     gphi_sum_weights(to, rows, false);
     return true;
 }
@@ -2629,7 +2903,7 @@ static void gphi_publish_maps(void *context, uint32_t begin, uint32_t end)
             memcpy(gphi_block_map(p->block, out->map), gphi_block_map(f->block, v->s.map), f->map_bytes);
         else {
             gphi_repair_map(f, v, map, scratch);
-            gphi_write_map(gphi_block_map(p->block, out->map), map, f->desc.rows); /* it is lit */
+            gphi_write_map(gphi_block_map(p->block, out->map), map, f->desc.rows, &v->s); /* it is lit */
         }
         out->alpha = v->s.verdict == GPH_GATE_CLOSED ? 1.0f : v->s.alpha;
     }
@@ -2786,7 +3060,7 @@ static void gphi_count(gph_field *f)
     f->guiding = 0;
     for (i = 0; i < f->voxel_count; ++i) {
         s->sparse += f->voxels[i].s.form == GPHI_FORM_SPARSE;
-        s->valid += f->voxels[i].s.valid;
+        s->valid += f->voxels[i].s.valid != 0;
     }
     for (i = 0; i < b->voxels; ++i) {
         const gph_voxel *v = &gphi_block_voxels(b)[i];
@@ -2822,6 +3096,7 @@ GPH_API gph_result gph_refine(gph_field *field, gph_parallel_fn parallel, void *
         if (!first && gphi_split_all(field))
             result = GPH_OUT_OF_MEMORY;
         gphi_recycle(field);
+        gphi_place_all(field);
         field->judged = 1; /* what follows may fail: then the next call only publishes */
     }
     if (gphi_publish_all(field, parallel, user))
@@ -2834,15 +3109,22 @@ GPH_API gph_result gph_refine(gph_field *field, gph_parallel_fn parallel, void *
 
 GPH_API bool gph_all_closed(const gph_field *field) { return field->guiding == 0; }
 
-GPH_API double gph_photons_at(const gph_field *field, const float position[3])
+GPH_API double gph_photons_at(const gph_field *field, const float position[3], const float *normal)
 {
     uint32_t voxel = gphi_find(field, position);
-    return voxel != GPH_NONE && field->voxels[voxel].s.valid ? field->voxels[voxel].s.photons : -1;
+    return voxel != GPH_NONE && field->voxels[voxel].s.valid & gph_sides(normal) ? field->voxels[voxel].s.photons : -1;
 }
 
-GPH_API bool gph_takes_photons(const gph_field *field, const float position[3])
+GPH_API double gph_vertices_at(const gph_field *field, const float position[3])
 {
-    return gph_photons_at(field, position) >= 0;
+    uint32_t voxel = gphi_find(field, position);
+    const gphi_state *s = voxel != GPH_NONE ? &field->voxels[voxel].s : NULL;
+    return s ? s->held.q_bsdf + s->held.q_guide + (double)s->touched : 0;
+}
+
+GPH_API bool gph_takes_photons(const gph_field *field, const float position[3], const float *normal)
+{
+    return gph_photons_at(field, position, normal) >= 0;
 }
 
 GPH_API void gph_get_stats(const gph_field *field, gph_stats *stats)
@@ -3057,7 +3339,7 @@ static void gphi_import_some(void *context, uint32_t begin, uint32_t end)
         uint32_t v = p->voxels[i], map = v < p->field->voxel_count ? p->field->voxels[v].s.map : GPH_NONE;
         if (map != GPH_NONE)
             p->taken[i] = gphi_write_map(gphi_block_map(p->field->block, map), p->maps + (size_t)i * p->field->bins,
-                                         p->field->desc.rows);
+                                         p->field->desc.rows, &p->field->voxels[v].s);
     }
 }
 
@@ -3304,14 +3586,21 @@ static bool gphi_sums_valid(const gphi_sums *s)
     return ok;
 }
 
+static bool gphi_pivot_ok(const float pivot[3], float nearness)
+{
+    return gphi_finite(pivot[0]) && gphi_finite(pivot[1]) && gphi_finite(pivot[2]) && nearness >= 0 &&
+           nearness <= 1e30f;
+}
+
 static bool gphi_voxel_valid(const gph_field *f, const gphi_voxel *v)
 {
     uint32_t i, n = gphi_bins(v, f->bins), last = 0;
     if (!gphi_sums_valid(&v->s.now) || !gphi_sums_valid(&v->s.held) || !(v->s.photons >= 0 && v->s.photons < 1e30) ||
-        v->s.valid > 1 || v->s.rolled > f->stats.passes || (v->s.map != GPH_NONE && v->s.map >= f->block->maps) ||
-        v->s.changed > 3 || v->sigma > GPHI_SIGMAS || v->s.verdict > GPH_GATE_CLOSED ||
-        !gphi_within_float(v->s.alpha, 0.04f, 1) || !gphi_within_float(v->s.reflected, 0, 1e30f) ||
-        !gphi_within_float(v->s.chosen, 0, 1e30f))
+        v->s.valid > GPH_ALL_SIDES || v->s.rolled > f->stats.passes ||
+        (v->s.map != GPH_NONE && v->s.map >= f->block->maps) || v->s.changed > 3 || v->sigma > GPHI_SIGMAS ||
+        v->s.verdict > GPH_GATE_CLOSED || !gphi_within_float(v->s.alpha, 0.04f, 1) ||
+        !gphi_within_float(v->s.reflected, 0, 1e30f) || !gphi_within_float(v->s.chosen, 0, 1e30f) ||
+        !gphi_pivot_ok(v->s.pivot, v->s.nearness))
         return false;
     for (i = 0; i < n; ++i) {
         gphi_bin b = gphi_get_bin(v, f->bins, i);
@@ -3351,9 +3640,8 @@ static gph_result gphi_building_valid(const gph_field *f)
     for (i = 0; ok && i < f->voxel_count; ++i)
         ok = t.seen[i] && gphi_form_valid(&f->voxels[i].s, f->voxels[i].capacity) && gphi_voxel_valid(f, &f->voxels[i]);
     for (i = 0; ok && i < f->cloud_count; ++i)
-        ok = f->cloud[i].hit.voxel < f->voxel_count && f->cloud[i].hit.bin < f->bins && f->cloud[i].hit.flux > 0 &&
-             f->cloud[i].hit.flux < GPHI_MAX_VALUE && gphi_position_ok(f->cloud[i].position) &&
-             gphi_find(f, f->cloud[i].position) == f->cloud[i].hit.voxel;
+        ok = f->cloud[i].voxel < f->voxel_count && gphi_photon_ok(&f->cloud[i].photon) && f->cloud[i].photon.flux > 0 &&
+             gphi_find(f, f->cloud[i].photon.position) == f->cloud[i].voxel;
     gphi_release(&f->desc, t.seen);
     return ok ? GPH_OK : GPH_CORRUPT;
 }
@@ -3365,7 +3653,7 @@ static bool gphi_map_valid(unsigned char *map, uint32_t rows)
     for (i = 0; i < rows * rows * 2; ++i)
         if (weights[i] > 0x7800)
             return false;
-    return gphi_sum_weights(map, rows, true);
+    return gphi_pivot_ok(gphi_map_pivot(map, rows), gphi_map_pivot(map, rows)[3]) && gphi_sum_weights(map, rows, true);
 }
 
 /* Shape of the block against its own counts: before anything in it is looked at. */
@@ -3582,6 +3870,7 @@ static gph_result gphi_merge_voxel(gph_field *f, uint32_t to, const gph_field *g
     gphi_voxel *v = &f->voxels[to];
     double *sum = (double *)(void *)&v->s.now;
     const double *more = (const double *)(const void *)&source->s.now;
+    float shift[3];
     uint32_t i, n = gphi_bins(source, g->bins), lit = 0;
     if (source->s.rolled != g->stats.passes)
         n = 0; /* no photons in this pass */
@@ -3594,13 +3883,20 @@ static gph_result gphi_merge_voxel(gph_field *f, uint32_t to, const gph_field *g
         lit += *gphi_get_bin(source, g->bins, i).count_now > 0;
     if (!lit)
         return GPH_OK;
+    if (v->s.form == GPHI_FORM_EMPTY) {
+        memcpy(v->s.pivot, source->s.pivot, sizeof v->s.pivot);
+        v->s.nearness = source->s.nearness;
+    }
+    gphi_shift(&source->s, v->s.pivot, shift);
     if (gphi_make_room(f, to, lit) || v->s.blocked)
         return GPH_OUT_OF_MEMORY;
     gphi_roll(v, f->bins, f->stats.passes);
     for (i = 0; i < n; ++i) {
         gphi_bin b = gphi_get_bin(source, g->bins, i);
+        uint32_t at =
+            shift[0] != 0 || shift[1] != 0 || shift[2] != 0 ? gphi_moved_bin(f->desc.rows, b.at, shift) : b.at;
         if (*b.count_now)
-            gphi_add(v, f->bins, b.at, *b.now, *b.count_now);
+            gphi_add(v, f->bins, at, *b.now, *b.count_now);
         f->stats.photons += *b.count_now;
     }
     v->s.changed |= 1;
@@ -3631,10 +3927,9 @@ static gph_result gphi_merge_cloud(gph_field *f, const gph_field *g, gph_paralle
     for (i = 0; i < g->cloud_count; i += b.count) {
         b.count = g->cloud_count - i < GPHI_BATCH ? g->cloud_count - i : GPHI_BATCH;
         for (k = 0; k < b.count; ++k) {
-            b.hits[k] = g->cloud[i + k].hit;
-            b.hits[k].voxel = gphi_find(f, g->cloud[i + k].position);
-            b.samples[k] = g->cloud[i + k].position;
-            f->stats.photons += b.hits[k].voxel < f->voxel_count;
+            b.voxel[k] = gphi_find(f, g->cloud[i + k].photon.position);
+            b.samples[k] = &g->cloud[i + k].photon;
+            f->stats.photons += b.voxel[k] < f->voxel_count;
         }
         if (gphi_settle(&b, parallel, user))
             result = GPH_OUT_OF_MEMORY;

@@ -67,11 +67,35 @@ static double naive_sum(const gph_handle *h, uint32_t bins)
     return sum;
 }
 
+/* Where a direction meets the sphere of the map. Returns solid angle from its middle per solid angle here. */
+static double naive_seen(const gph_handle *h, const float *w, float *seen)
+{
+    double b = 0, l = 0, s;
+    for (int k = 0; k < 3; ++k) {
+        b += (double)h->offset[k] * (double)w[k];
+        l += (double)h->offset[k] * (double)h->offset[k];
+    }
+    s = sqrt(1 - l + b * b);
+    for (int k = 0; k < 3; ++k)
+        seen[k] = (float)((double)h->offset[k] + (s - b) * (double)w[k]);
+    return (s - b) * (s - b) / s;
+}
+
 /* sum: of all weights. */
 static double naive_pdf(const gph_handle *h, double sum, const float *w)
 {
-    double bins = (double)h->rows * h->columns, e = (double)h->uniform;
-    return ((1 - e) * naive_weight(h->weights[naive_bin(h->rows, w)]) / sum * bins + e) / (4 * SF1_PI);
+    float seen[3];
+    double bins = (double)h->rows * h->columns, e = (double)h->uniform, scale = naive_seen(h, w, seen);
+    return scale * ((1 - e) * naive_weight(h->weights[naive_bin(h->rows, seen)]) / sum * bins + e) / (4 * SF1_PI);
+}
+
+/* Whether rounding may put a direction, as seen from the map's pivot, in the next bin. */
+static bool at_an_edge(const gph_handle *h, const float *w)
+{
+    float seen[3];
+    naive_seen(h, w, seen);
+    double z = (seen[2] + 1.0) * 0.5 * h->rows, phi = atan2((double)seen[1], (double)seen[0]) / SF1_PI * h->rows;
+    return fabs(z - nearbyint(z)) < 1e-4 || fabs(phi - nearbyint(phi)) < 1e-4;
 }
 
 /* Row by the sums of rows, then bin by bin; as gph_sample without a normal. */
@@ -96,6 +120,13 @@ static void naive_sample(const gph_handle *h, double sum, const float *u, float 
     w[0] = (float)(sqrt(fmax(0, 1 - z * z)) * cos(phi));
     w[1] = (float)(sqrt(fmax(0, 1 - z * z)) * sin(phi));
     w[2] = (float)z;
+    double l = 0;
+    for (int k = 0; k < 3; ++k) {
+        w[k] -= h->offset[k];
+        l += (double)w[k] * (double)w[k];
+    }
+    for (int k = 0; k < 3; ++k)
+        w[k] = (float)((double)w[k] / sqrt(l));
 }
 
 /* ---- learning */
@@ -267,6 +298,7 @@ static void ask_densities(const gph_view *view, queries *q)
 static void validate(const gph_view *view, queries *q)
 {
     double worst = 0, apart = 0;
+    int edges = 0;
     find_and_sample(view, q, false);
     for (int i = 0; i < QUERIES; ++i) {
         float w[3];
@@ -280,10 +312,13 @@ static void validate(const gph_view *view, queries *q)
     ask_densities(view, q);
     for (int i = 0; i < QUERIES; ++i) {
         double p = naive_pdf(&q->handle[i], q->sum[i], q->given[i]);
-        worst = fmax(worst, fabs((double)q->pdf[i] - p) / p);
+        if (at_an_edge(&q->handle[i], q->given[i]))
+            ++edges;
+        else
+            worst = fmax(worst, fabs((double)q->pdf[i] - p) / p);
     }
     printf("\nchecked: densities within %.1e of double precision, samples within %.1e\n", worst, apart);
-    if (worst > 1e-5 || apart > 1e-3)
+    if (worst > 1e-5 || apart > 1e-3 || edges > QUERIES / 500)
         fail("queries do not agree with double precision");
 }
 
@@ -303,8 +338,10 @@ static void validate_histograms(void)
     uint32_t inside = 0;
     for (uint32_t i = 0; i < l.photon_count; ++i) { /* the walls at 1 lie in cubes that the naive grid has not */
         const float *p = l.photons[i].position;
-        if (p[0] < 1 && p[1] < 1 && p[2] < 1)
-            l.photons[inside++] = l.photons[i];
+        if (p[0] < 1 && p[1] < 1 && p[2] < 1) {
+            l.photons[inside] = l.photons[i];
+            l.photons[inside++].nearness = 0; /* seen alike from everywhere in a voxel */
+        }
     }
     l.photon_count = inside;
     memset(&desc, 0, sizeof desc);

@@ -95,8 +95,10 @@ static void check_field(stress *s, gph_field *f)
         for (uint32_t row = 0; row < h.rows; ++row)
             for (uint32_t c = 0; c < h.columns; ++c) {
                 double z = (row + 0.5) * 2 / h.rows - 1, phi = 2 * PI * (c + 0.5) / h.columns, x = sqrt(1 - z * z);
-                float d[3] = {(float)(x * cos(phi)), (float)(x * sin(phi)), (float)z};
-                sum += (double)gph_pdf(&h, d) * 4 * PI / (h.rows * h.columns);
+                float d[3] = {(float)(x * cos(phi)), (float)(x * sin(phi)), (float)z}, seen[3];
+                gph_from_pivot(h.offset,
+                               d); /* equal areas of the pivot's sphere, with bins that are those of the map */
+                sum += (double)gph_pdf(&h, d) / (double)gph_to_pivot(h.offset, d, seen) * 4 * PI / (h.rows * h.columns);
             }
         STRESS_CHECK(s, fabs(sum - 1) < 1e-5, "integral %g", sum);
         any_normal(s, n);

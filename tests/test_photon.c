@@ -151,7 +151,7 @@ static void learn_at(gph_field *f, const float p[3], uint32_t photons)
     for (uint32_t i = 0; i < photons; ++i) {
         float d[3];
         draw_light(d);
-        q[i] = gph_make_photon(p, d, 2, 1);
+        q[i] = gph_make_photon(p, d, INFINITY, 1);
     }
     learn(f, &v, 1, q, photons);
     OK(gph_refine(f, NULL, NULL));
@@ -405,6 +405,48 @@ static void test_sampling_is_monotone_in_u(void **state)
     gph_destroy(f);
 }
 
+/* Photons on the other side of a thin wall, which no camera path meets, are not asked for. */
+static void test_sides_that_nobody_sees_take_no_photons(void **state)
+{
+    (void)state;
+    gph_desc d = unit_cube();
+    const float p[3] = {0.1f, 0.1f, 0.1f}, up[3] = {0, 0, 1}, down[3] = {0, 0, -1}, slanted[3] = {0.6f, 0, 0.8f};
+    const float zero[3] = {0, 0, 0}, side[3] = {-1, 0, 0};
+    gph_field *f;
+    gph_vertex v = touch(p);
+    assert_true(gph_sides(NULL) == GPH_ALL_SIDES && gph_sides(zero) == GPH_ALL_SIDES);
+    seed(12);
+    for (int i = 0; i < 1000; ++i) {
+        float n[3], m[3];
+        random_direction(n);
+        for (int k = 0; k < 3; ++k)
+            m[k] = -n[k];
+        assert_true(gph_sides(n) != 0 && gph_sides(n) < GPH_ALL_SIDES && (gph_sides(n) & gph_sides(m)) == 0);
+    }
+    OK(gph_create(&d, &f));
+    v.sides = GPH_ALL_SIDES + 1;
+    learn(f, &v, 1, NULL, 0);
+    assert_true(stats_of(f).refused == 1 && !gph_takes_photons(f, p, NULL));
+    v.sides = (uint16_t)gph_sides(up);
+    learn(f, &v, 1, NULL, 0);
+    assert_true(gph_takes_photons(f, p, up) && gph_takes_photons(f, p, slanted) && gph_takes_photons(f, p, NULL));
+    assert_true(!gph_takes_photons(f, p, down) && gph_photons_at(f, p, down) < 0 && !gph_takes_photons(f, p, side));
+    OK(gph_validate(f));
+    assert_int_equal(gphi_find(f, p), 0);
+    v.sides = 0;
+    learn(f, &v, 1, NULL, 0);
+    OK(gph_refine(f, NULL, NULL));
+    assert_true(gph_takes_photons(f, p, down) && gph_takes_photons(f, p, side) && stats_of(f).valid == 1);
+    v = gph_make_vertex(p, 1, 1, 1, 1, GPH_FROM_BSDF);
+    for (int pass = 0; pass < 2; ++pass) {
+        learn(f, &v, 1, NULL, 0);
+        assert_true(gph_vertices_at(f, p) == (pass ? 2 : 1) && gph_vertices_at(f, up) == 0);
+        OK(gph_refine(f, NULL, NULL));
+    }
+    assert_true(gph_vertices_at(f, p) == 1.5);
+    gph_destroy(f);
+}
+
 static void test_a_known_distribution_is_recovered(void **state)
 {
     (void)state;
@@ -472,7 +514,7 @@ static void test_the_blur_is_as_wide_as_the_light_allows(void **state)
             for (int i = 0; i < 300; ++i) {
                 float w[3];
                 draw_lobe(mean_a, kind == 0 ? 0.5 : kind == 1 ? 20 : 200, w);
-                q[i] = gph_make_photon(p, w, 1, 1);
+                q[i] = gph_make_photon(p, w, INFINITY, 1);
             }
             d.sigma = sigmas[k];
             OK(gph_create(&d, &f));
@@ -524,7 +566,7 @@ static void test_blur_wraps_and_crosses_the_poles(void **state)
         d.sigma = 1;
         OK(gph_create(&d, &f));
         direction_at(cases[i].z, cases[i].phi, w);
-        gph_photon q = gph_make_photon(p, w, 1, 3);
+        gph_photon q = gph_make_photon(p, w, INFINITY, 3);
         learn(f, &v, 1, &q, 1);
         OK(gph_refine(f, NULL, NULL));
         gph_handle h = find(f, p);
@@ -675,12 +717,12 @@ static void test_sizes_are_as_documented(void **state)
 {
     (void)state;
     assert_int_equal(sizeof(gph_vertex), 32);
-    assert_int_equal(sizeof(gph_photon), 28);
+    assert_int_equal(sizeof(gph_photon), 32);
     assert_int_equal(sizeof(gph_voxel), 20);
     assert_int_equal(sizeof(gph_node), 8);
-    assert_int_equal(sizeof(gphi_voxel), 360);
+    assert_int_equal(sizeof(gphi_voxel), 408);
     assert_int_equal(sizeof(gphi_entry), 16);
-    assert_int_equal(sizeof(gphi_cloud_photon), 24);
+    assert_int_equal(sizeof(gphi_cloud_photon), 36);
     assert_true(sizeof(gph_handle) <= 88);
     assert_int_equal(sizeof(gph_stats) % 8, 0);
     for (uint32_t rows = 16; rows <= 64; rows *= 2) { /* the sampling side is within twice the half-floats */
@@ -745,7 +787,7 @@ static void test_far_and_small_and_large_scenes_work(void **state)
                 for (int a = 0; a < 3; ++a)
                     p[a] = (float)(place[i] + scale[i] * rnd());
                 draw_light(w);
-                gph_photon q = gph_make_photon(p, w, 1, 1);
+                gph_photon q = gph_make_photon(p, w, INFINITY, 1);
                 gph_vertex v = touch(p);
                 OK(gph_record_photons(s, &q, 1));
                 if (k % 8 == 0)
@@ -788,24 +830,25 @@ static void test_only_places_of_camera_paths_take_photons(void **state)
     gph_field *f;
     float here[3] = {0.1f, 0.1f, 0.1f}, there[3] = {0.9f, 0.9f, 0.9f}, w[3] = {0, 0, 1};
     gph_vertex v = touch(here);
-    gph_photon q[2] = {gph_make_photon(here, w, 1, 1), gph_make_photon(there, w, 1, 1)};
+    gph_photon q[2] = {gph_make_photon(here, w, INFINITY, 1), gph_make_photon(there, w, 1, 1)};
     OK(gph_create(&d, &f));
     learn(f, NULL, 0, q, 2); /* before any camera path: nobody reads them */
     assert_int_equal(stats_of(f).unread, 2);
-    assert_true(gph_photons_at(f, here) < 0 && gph_photons_at(f, there) < 0);
+    assert_true(gph_photons_at(f, here, NULL) < 0 && gph_photons_at(f, there, NULL) < 0);
     learn(f, &v, 1, q, 2);
-    assert_true(gph_photons_at(f, here) == 0 && gph_photons_at(f, there) < 0); /* they wait for the refine */
+    assert_true(gph_photons_at(f, here, NULL) == 0 &&
+                gph_photons_at(f, there, NULL) < 0); /* they wait for the refine */
     OK(gph_refine(f, NULL, NULL));
-    assert_true(gph_photons_at(f, here) == 1 && gph_photons_at(f, there) < 0);
+    assert_true(gph_photons_at(f, here, NULL) == 1 && gph_photons_at(f, there, NULL) < 0);
     gph_stats s = stats_of(f);
     assert_int_equal(s.photons, 1);
     assert_int_equal(s.unread, 3);
     assert_int_equal(s.voxels, 1);
     assert_int_equal(s.maps, 1);
     assert_int_equal(s.sparse, 1);
-    assert_true(gph_takes_photons(f, here) && !gph_takes_photons(f, there));
+    assert_true(gph_takes_photons(f, here, NULL) && !gph_takes_photons(f, there, NULL));
     learn(f, NULL, 0, q, 1);
-    assert_true(gph_photons_at(f, here) == 2); /* later passes count at once */
+    assert_true(gph_photons_at(f, here, NULL) == 2); /* later passes count at once */
     gph_destroy(f);
 }
 
@@ -851,7 +894,7 @@ static void test_first_pass_is_cut_at_the_median(void **state)
     seed(31);
     for (int i = 0; i < N; ++i) {
         float at[3] = {0.1f * rndf(), rndf(), rndf()};
-        q[i] = gph_make_photon(at, w, 1, 1);
+        q[i] = gph_make_photon(at, w, INFINITY, 1);
     }
     OK(gph_create(&d, &f));
     learn(f, &v, 1, q, N);
@@ -914,13 +957,13 @@ static void test_later_passes_are_cut_in_the_middle_and_halves_inherit(void **st
     d.grid_cells = 1;
     d.split_photons = 1000;
     for (int i = 0; i < N; ++i)
-        q[i] = gph_make_photon(p, w, 1, 1);
+        q[i] = gph_make_photon(p, w, INFINITY, 1);
     OK(gph_create(&d, &f));
     learn(f, &v, 1, q, N);
     OK(gph_refine(f, NULL, NULL));
     assert_int_equal(stats_of(f).splits, 0);
     learn(f, &v, 1, q, N); /* 1800 > 1000 sqrt(1800 / 900) */
-    assert_true(gph_photons_at(f, p) == 2 * N && gph_photons_at(f, other) == 2 * N);
+    assert_true(gph_photons_at(f, p, NULL) == 2 * N && gph_photons_at(f, other, NULL) == 2 * N);
     gph_handle before = find(f, p);
     float density = gph_pdf(&before, w);
     OK(gph_refine(f, NULL, NULL));
@@ -931,11 +974,11 @@ static void test_later_passes_are_cut_in_the_middle_and_halves_inherit(void **st
     gph_handle low = find(f, p), high = find(f, other);
     assert_true(low.voxel != high.voxel);
     assert_true(gph_pdf(&low, w) == density && gph_pdf(&high, w) == density);
-    assert_false(gph_takes_photons(f, p)); /* until it is touched again */
-    assert_true(gph_photons_at(f, p) < 0 && gph_photons_at(f, other) < 0);
+    assert_false(gph_takes_photons(f, p, NULL)); /* until it is touched again */
+    assert_true(gph_photons_at(f, p, NULL) < 0 && gph_photons_at(f, other, NULL) < 0);
     learn(f, &v, 1, NULL, 0);
-    assert_true(gph_takes_photons(f, p) && !gph_takes_photons(f, other));
-    assert_true(gph_photons_at(f, p) == N && gph_photons_at(f, other) < 0); /* half of them */
+    assert_true(gph_takes_photons(f, p, NULL) && !gph_takes_photons(f, other, NULL));
+    assert_true(gph_photons_at(f, p, NULL) == N && gph_photons_at(f, other, NULL) < 0); /* half of them */
     gph_destroy(f);
 }
 
@@ -961,7 +1004,7 @@ static void test_unread_voxels_are_recycled(void **state)
     }
     for (int pass = 0; pass < 4; ++pass) {
         gph_vertex v = touch(p);
-        gph_photon q = gph_make_photon(p, w, 1, 1);
+        gph_photon q = gph_make_photon(p, w, INFINITY, 1);
         learn(f, &v, 1, &q, 1);
         OK(gph_refine(f, NULL, NULL));
         OK(gph_validate(f));
@@ -1005,7 +1048,7 @@ static void test_memory_of_a_voxel_is_bounded(void **state)
                 for (uint32_t m = 0; m < counts[i]; ++m) {
                     float w[3];
                     random_direction(w);
-                    q[m] = gph_make_photon(p, w, 1, 1);
+                    q[m] = gph_make_photon(p, w, INFINITY, 1);
                 }
                 learn(f, &v, 1, q, counts[i]);
                 free(q);
@@ -1029,7 +1072,7 @@ static void test_memory_of_a_voxel_is_bounded(void **state)
                 for (int k = 0; k < VOXELS; ++k) {
                     p[0] = ((float)k + 0.5f) / VOXELS;
                     gph_vertex v = touch(p);
-                    gph_photon q = gph_make_photon(p, mean_a, 1, 1);
+                    gph_photon q = gph_make_photon(p, mean_a, INFINITY, 1);
                     learn(f, &v, 1, &q, counts[i] > 0);
                 }
                 OK(gph_refine(f, NULL, NULL));
@@ -1090,7 +1133,7 @@ static void test_bad_samples_are_refused_and_leave_no_trace(void **state)
     gph_vertex v[64];
     uint32_t n = 0, m = 0;
     for (int i = 0; i < 6; ++i) {
-        q[n++] = gph_make_photon(p, w, 1, bad[i]);
+        q[n++] = gph_make_photon(p, w, INFINITY, bad[i]);
         if (i != 3) {
             for (int k = 0; k < 3; ++k) {
                 float o[3] = {0.1f, 0.1f, 0.1f};
@@ -1124,7 +1167,7 @@ static void test_bad_samples_are_refused_and_leave_no_trace(void **state)
     learn(f, v, m, q, n);
     gph_stats s = stats_of(f);
     assert_int_equal(s.refused, n + m);
-    gph_photon dark = gph_make_photon(p, w, 1, 0);
+    gph_photon dark = gph_make_photon(p, w, INFINITY, 0);
     learn(f, NULL, 0, &dark, 1);
     assert_int_equal(stats_of(f).dark, 1);
     OK(gph_refine(f, NULL, NULL));
@@ -1150,7 +1193,7 @@ static void test_extreme_histograms_stay_finite(void **state)
             gph_vertex v = touch(p);
             d.repair = GPH_REPAIR_NONE;
             for (int k = 0; k < 600; ++k)
-                q[k] = gph_make_photon(p, w[k % bins], 1, fluxes[i][k & 1]);
+                q[k] = gph_make_photon(p, w[k % bins], INFINITY, fluxes[i][k & 1]);
             OK(gph_create(&d, &f));
             for (int pass = 0; pass < 2; ++pass) {
                 learn(f, &v, 1, q, 600);
@@ -1182,7 +1225,7 @@ static void test_many_photons_in_one_bin(void **state)
     d.repair = GPH_REPAIR_NONE;
     d.split_photons = 1e9f;
     for (int k = 0; k < N; ++k)
-        q[k] = gph_make_photon(p, w[k % 4 == 0], 1, 1);
+        q[k] = gph_make_photon(p, w[k % 4 == 0], INFINITY, 1);
     OK(gph_create(&d, &f));
     for (int pass = 0; pass < 3; ++pass) {
         learn(f, &v, 1, q, 60000);
@@ -1380,6 +1423,10 @@ static void test_validate_notices_damage(void **state)
     NOTICED(f->voxels[3].s.alpha, NAN);
     NOTICED(f->voxels[3].s.photons, -1);
     NOTICED(f->voxels[3].s.now.count, NAN);
+    NOTICED(f->voxels[3].s.pivot[1], NAN);
+    NOTICED(f->voxels[3].s.nearness, -1);
+    NOTICED(gphi_map_pivot(gphi_block_map(f->block, 0), 32)[2], INFINITY);
+    NOTICED(gphi_map_pivot(gphi_block_map(f->block, 0), 32)[3], NAN);
     NOTICED(f->block->maps, f->block->maps + 1);
     NOTICED(gphi_block_voxels(f->block)[0].map, f->block->maps);
     NOTICED(gphi_map_weights(gphi_block_map(f->block, 0), 32)[5], 0x7c00);
@@ -1482,7 +1529,7 @@ static int scenario(counter *c)
             p[0] *= pass == 3 ? 0.3f : 1; /* the rest is recycled */
             draw_light(w);
             gph_vertex v = touch(p);
-            gph_photon q = gph_make_photon(p, w, 1, 1);
+            gph_photon q = gph_make_photon(p, w, INFINITY, 1);
             if (i < 300)
                 TRY(gph_record_vertices(s[0], &v, 1));
             TRY(gph_record_photons(s[1], &q, 1));
@@ -1594,7 +1641,7 @@ static void test_queries_do_not_allocate_and_lost_samples_are_counted(void **sta
     (void)stats_of(f);
     (void)gph_structure_id(f);
     (void)gph_save_bound(f);
-    (void)gph_takes_photons(f, p);
+    (void)gph_takes_photons(f, p, NULL);
     (void)gph_changed_voxels(f, voxel, 4);
     voxel[0] = 0;
     gph_export_maps(f, voxel, 1, x, NULL);
@@ -1602,7 +1649,7 @@ static void test_queries_do_not_allocate_and_lost_samples_are_counted(void **sta
     assert_int_equal(c.requests, before);
     OK(gph_stream_create(f, &s));
     for (int i = 0; i < 1000; ++i)
-        q[i] = gph_make_photon(p, w, 1, 1);
+        q[i] = gph_make_photon(p, w, INFINITY, 1);
     c.fail_at = c.requests + 2; /* the second chunk */
     assert_int_equal(gph_record_photons(s, q, 1000), GPH_OUT_OF_MEMORY);
     assert_int_equal(gph_stream_size(s), 256);
@@ -1757,8 +1804,8 @@ static void test_maps_go_out_and_come_back(void **state)
     float p[3] = {0.1f, 0.1f, 0.1f}, q[3] = {0.9f, 0.1f, 0.1f}, w[2][3] = {{0, 0.1f, 1}, {1, 0.1f, 0.01f}};
     gph_field *f;
     gph_vertex v[2] = {touch(p), touch(q)};
-    gph_photon a[4] = {gph_make_photon(p, w[0], 1, 1), gph_make_photon(p, w[1], 1, 3), gph_make_photon(p, w[1], 1, 3),
-                       gph_make_photon(q, w[0], 1, 1)};
+    gph_photon a[4] = {gph_make_photon(p, w[0], INFINITY, 1), gph_make_photon(p, w[1], INFINITY, 3),
+                       gph_make_photon(p, w[1], INFINITY, 3), gph_make_photon(q, w[0], INFINITY, 1)};
     OK(gph_create(&d, &f));
     learn(f, v, 2, a, 2); /* pass 0: one photon in each bin, of flux 1 and 3 */
     learn(f, NULL, 0, a + 3, 1);
@@ -1824,6 +1871,7 @@ int main(void)
         cmocka_unit_test(test_samples_follow_the_density),
         cmocka_unit_test(test_samples_at_the_edges_of_bins_stay_inside),
         cmocka_unit_test(test_sampling_is_monotone_in_u),
+        cmocka_unit_test(test_sides_that_nobody_sees_take_no_photons),
         cmocka_unit_test(test_a_known_distribution_is_recovered),
         cmocka_unit_test(test_every_repair_helps_where_photons_are_few),
         cmocka_unit_test(test_the_blur_is_as_wide_as_the_light_allows),

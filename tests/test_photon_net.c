@@ -59,7 +59,7 @@ static gph_photon photon_in(int bin, float flux)
     double z = 2 * (bin / PN_COLUMNS + 0.1 + 0.8 * rnd()) / PN_ROWS - 1;
     double phi = 6.283185307 * (bin % PN_COLUMNS + 0.1 + 0.8 * rnd()) / PN_COLUMNS, r = sqrt(1 - z * z);
     float d[3] = {(float)(r * cos(phi)), (float)(r * sin(phi)), (float)z};
-    return gph_make_photon(at, d, 1, flux);
+    return gph_make_photon(at, d, INFINITY, flux);
 }
 
 static int draw_bin(const double truth[PN_AREA])

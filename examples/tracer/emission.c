@@ -9,9 +9,9 @@
      >>warp     from even numbers to the density
 
    A voxel that has M photons knows its light to about 1 / M of its variance, and a path that brings it h more changes
-   that by h / M: the mean over all places of the squared relative error is least with a density proportional to the
-   root of E[(sum of 1 / M over the path's photons)^2]. A share of all paths stays even: no photon weighs more than 1 /
-   EVEN of what it would. */
+   that by h / M: the mean of the squared relative error over what camera paths meet, n vertices in each voxel, is
+   least with a density proportional to the root of E[(sum of root(n) / M over the path's photons)^2]. A share of all
+   paths stays even: no photon weighs more than 1 / EVEN of what it would. */
 #include "emission.h"
 
 #include <stdlib.h>
@@ -31,7 +31,7 @@
 
 typedef struct sample {
     float u[AXES], weight; /* weight: 1 / density */
-    float need;            /* sum of 1 / M over its photons, faded */
+    float need;            /* sum of root(n) / M over its photons, faded */
     uint16_t age;          /* passes */
     uint16_t halvings;     /* it stands for 2^halvings paths */
 } sample;

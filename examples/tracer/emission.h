@@ -9,8 +9,9 @@
    were of use in the last passes are many: then only one of every 2, 4, ... of them is kept. */
 tr_emission_map *tr_emission_map_create(int tiles); /* NULL = out of memory */
 void tr_emission_map_destroy(tr_emission_map *map);
-/* A photon of use, by its u and density; need > 0, any scale: the inverse of how many are known where it came, as the
-   relative error there falls with them. Streams as in tr_photon_fn. False = out of memory. */
+/* A photon of use, by its u and density; need > 0, any scale: the root of how many camera vertices meet the place where
+   it came, over how many photons are known there, as the relative error falls with them. Streams as in tr_photon_fn.
+   False = out of memory. */
 bool tr_emission_map_record(tr_emission_map *map, int tile, const float u[5], float density, float need);
 void tr_emission_map_flush(tr_emission_map *map);           /* take in what the tiles recorded */
 void tr_emission_map_learn(tr_emission_map *map);           /* a pass has ended: learn from those of the last 13 */

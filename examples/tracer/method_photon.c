@@ -4,7 +4,8 @@
    repair=none|gaussian|pyramid|pull_push, sigma (bins), pyramid_levels, rows=16|32|64, grid (cubes along the longest
    side of the scene), c (photons before a voxel splits), max_levels, keep_passes, max_memory_mb,
    learn_alpha=ratio|variance|off (on = variance), alpha, gate=on|off, gate_margin, gate_probe, uniform, surface=on|off
-   (what lies below the surface is mirrored up), jitter=on|off (find looks up a jittered position).
+   (what lies below the surface is mirrored up), jitter=on|off (find looks up a jittered position), parallax=on|off
+   (off: photons do not tell their distances).
 
    A pass's photons are traced after its camera paths, which make voxels valid, also those that the refine before has
    cut. They start where earlier ones came to valid voxels (emission=on|off). How many there are follows from counted
@@ -20,9 +21,9 @@
 #define IDLE_PASSES 4     /* between two passes with photons where they are of no use */
 #define WORK_SHARE 0.75   /* photons' part of the work, as camera paths' part is 1 */
 #define FIRST_WORK 4      /* of a photon path, before there was any */
-#define MIN_YIELD 0.001   /* photons that valid voxels take, per path: below it they are of no use ... */
+#define MIN_YIELD 0.0001  /* photons that valid voxels take, per path: below it they are of no use ... */
 #define PATIENCE 2        /* ... after so many passes */
-#define FEW_PHOTONS 32    /* in a voxel: the first ones say less than each is worth by 1 / M */
+#define FEW_PHOTONS 32    /* in a voxel: the first ones say less than each is worth by root(n) / M */
 #define PROBE_SHARE 0.125 /* of the paths, while they are of no use */
 
 /* What the last pass's photons cost and were good for; see >>budget. */
@@ -41,7 +42,7 @@ typedef struct photon {
     gph_view view;
     gph_stream **streams; /* of camera paths; those of photons follow */
     int tiles, photon_tiles;
-    bool surface, jitter, adapts;
+    bool surface, jitter, adapts, parallax;
     tr_emission_map *emission; /* NULL: even emission */
     double per_path, paths;    /* photon paths per camera path; camera paths of one sample per pixel */
     photon_budget budget;
@@ -80,6 +81,7 @@ static bool parse(parser *p, gph_desc *d, photon *m)
     d->gate_probe = whole(p, "gate_probe", 0);
     m->surface = choice(p, "surface", "off|on") != 0;
     m->jitter = choice(p, "jitter", "off|on") == 1;
+    m->parallax = choice(p, "parallax", "off|on") != 0;
     if (p->ok && learns_emission && !(m->emission = tr_emission_map_create(m->photon_tiles))) {
         snprintf(p->err, p->err_size, "photon: out of memory");
         return false;
@@ -223,14 +225,20 @@ static const tr_emission_map *photon_emission(void *method) { return ((const pho
 
 /* ---- records */
 
+/* The side that a direction lies on. */
+static vec3 towards(vec3 normal, vec3 direction) { return dot3(normal, direction) < 0 ? neg3(normal) : normal; }
+
 static gph_vertex convert(const tr_vertex *v)
 {
     float p[3], contribution = v->cosine * (v->f.x * v->L.x + v->f.y * v->L.y + v->f.z * v->L.z) / 3;
     memcpy(p, &v->p, sizeof p);
     if (v->flags & TR_VERTEX_REJECTED)
         contribution = 0;
-    return gph_make_vertex(p, contribution, v->pdf_mix, v->pdf_bsdf, v->pdf_guide,
-                           v->flags & TR_VERTEX_GUIDED ? GPH_FROM_GUIDE : GPH_FROM_BSDF);
+    gph_vertex vertex = gph_make_vertex(p, contribution, v->pdf_mix, v->pdf_bsdf, v->pdf_guide,
+                                        v->flags & TR_VERTEX_GUIDED ? GPH_FROM_GUIDE : GPH_FROM_BSDF);
+    vec3 normal = towards(v->ng, v->wo);
+    vertex.sides = (uint16_t)gph_sides(v->flags & TR_VERTEX_PASSES ? NULL : &normal.x);
+    return vertex;
 }
 
 static bool photon_record(void *method, int tile, const tr_vertex *vertices, int n)
@@ -249,7 +257,8 @@ static bool photon_record(void *method, int tile, const tr_vertex *vertices, int
     return ok;
 }
 
-/* Those that next-event estimation finds anyhow, and those that no camera path can find, are of no use. */
+/* Those that next-event estimation finds anyhow, those that no camera path can find, and those that arrive where none
+   comes, as on a roof's outside, are of no use. */
 static bool photon_record_photons(void *method, int tile, const tr_photon *photons, int n)
 {
     photon *m = method;
@@ -260,16 +269,18 @@ static bool photon_record_photons(void *method, int tile, const tr_photon *photo
         int k = 0;
         for (; k < 64 && done < n; ++done) {
             const tr_photon *p = &photons[done];
+            const vec3 normal = towards(p->ng, p->wi);
             float at[3], from[3];
-            if (p->flags)
-                continue;
             memcpy(at, &p->p, sizeof at);
-            double known = m->emission ? gph_photons_at(m->field, at) : -1;
-            if (known >= 0)
-                ok = tr_emission_map_record(m->emission, tile, p->u, p->density, (float)(1 / (known + FEW_PHOTONS))) &&
-                     ok;
+            double known = p->flags ? -1 : gph_photons_at(m->field, at, &normal.x);
+            if (known < 0)
+                continue;
+            if (m->emission) {
+                double need = sqrt(gph_vertices_at(m->field, at)) / (known + FEW_PHOTONS);
+                ok = tr_emission_map_record(m->emission, tile, p->u, p->density, (float)need) && ok;
+            }
             memcpy(from, &p->wi, sizeof from);
-            samples[k++] = gph_make_photon(at, from, p->distance,
+            samples[k++] = gph_make_photon(at, from, m->parallax ? p->distance : INFINITY,
                                            (float)((double)((p->flux.x + p->flux.y + p->flux.z) / 3) * m->flux));
         }
         ok = !gph_record_photons(m->streams[m->tiles + tile], samples, (uint32_t)k) && ok;

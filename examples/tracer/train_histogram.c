@@ -373,8 +373,9 @@ static void make_fields(room *m)
     static const float sigmas[] = {0, 0.7f, 1.4f, 2.8f, 0, 0};
     gph_desc d;
     memset(&d, 0, sizeof d);
-    memcpy(d.bounds_min, &m->scene->bounds_min, sizeof d.bounds_min);
-    memcpy(d.bounds_max, &m->scene->bounds_max, sizeof d.bounds_max);
+    const vec3 low = turned(m, m->scene->bounds_min), high = turned(m, m->scene->bounds_max);
+    memcpy(d.bounds_min, &low, sizeof d.bounds_min);
+    memcpy(d.bounds_max, &high, sizeof d.bounds_max);
     d.grid_cells = m->size.x > 0 ? 5 + (uint32_t)(rng_float(&m->rng) * 8) : 0; /* the default */
     m->field_count = m->set->planes == HELD_PLANES ? FIELDS : 1;
     for (int k = 0; k < m->field_count; ++k) {
@@ -394,11 +395,11 @@ static bool record(void *user, int tile, const tr_photon *photons, int n)
     (void)tile;
     for (int i = 0; i < n; ++i) {
         const tr_photon *p = &photons[i];
-        vec3 d = turned(m, p->wi);
+        vec3 place = turned(m, p->p), d = turned(m, p->wi);
         float at[3], from[3];
         if (!within_room(m, p->p))
             continue;
-        memcpy(at, &p->p, sizeof at);
+        memcpy(at, &place, sizeof at);
         memcpy(from, &d, sizeof from);
         gph_vertex v = gph_make_vertex(at, 0, 1, 1, 0, GPH_TOUCH_ONLY);
         gph_photon photon = gph_make_photon(at, from, p->distance, (float)((double)mean3(p->flux) * m->flux));
@@ -478,19 +479,21 @@ static bool count_dense(void *user, int tile, const tr_photon *photons, int n)
     (void)tile;
     for (int i = 0; i < n; ++i) {
         const tr_photon *p = &photons[i];
-        float at[3], from[3];
-        vec3 d = turned(m, p->wi);
-        uint32_t bin = GPH_NONE;
+        float at[3], from[3], seen[3];
+        vec3 place = turned(m, p->p), d = turned(m, p->wi);
         if (p->flags || !(p->distance > 0) || !within_room(m, p->p))
             continue;
-        memcpy(at, &p->p, sizeof at);
+        memcpy(at, &place, sizeof at);
         memcpy(from, &d, sizeof from);
         for (int k = 0; k < m->snapshot_count; ++k) {
             const snapshot *s = &m->snapshots[k];
-            uint32_t voxel = gph_find_voxel(&s->view, at), slot = voxel == GPH_NONE ? GPH_NONE : s->slots[voxel];
+            gph_handle handle;
+            gph_find(&s->view, at, NULL, NULL, &handle);
+            uint32_t slot = handle.voxel == GPH_NONE ? GPH_NONE : s->slots[handle.voxel];
             if (slot == GPH_NONE)
                 continue;
-            bin = bin == GPH_NONE ? gph_bin(PN_ROWS, PN_COLUMNS, from) : bin;
+            gph_to_pivot(handle.offset, from, seen);
+            uint32_t bin = gph_bin(PN_ROWS, PN_COLUMNS, seen);
             set_map(m->set, slot)[(size_t)(TRUTH_A + m->half) * PN_AREA + bin] += mean3(p->flux) * (float)m->flux;
             m->set->photons[2 * (size_t)slot + 1] += 1;
         }
