@@ -6,6 +6,7 @@
 #   make bench-readme                     put the last bench's figures into the README
 #   make bench-error [PRESET=quick|full]  error against run time: tables and plots in out/bench-error-PRESET
 #   make bench-error PRESET=denoise       trained and then frozen fields: not denoised, after and during the training
+#   make bench-denoise                     what denoising quadtrees is worth: out/bench-denoise.md
 #   make study-kd [PRESET=quick|full]     signatures of guide_kd.h against sample counts: out/study-kd-PRESET
 #   make study-kd-readme [PRESET=quick]   put its tables and pictures into the README
 #   make stress      hostile and extreme input for every header, STRESS_SECONDS=30 STRESS_SEED=1 STRESS_ONLY=group
@@ -111,7 +112,7 @@ TEST_PROGRAMS := $(if $(TESTS),$(filter $(TESTS:%=$(B)/tests/test_%),$(TESTS_ALL
 SOURCES := $(sort $(HEADERS) $(wildcard examples/*.c examples/tracer/*.[ch] examples/tracer/*.cpp tests/*.[ch] tests/*/*.[ch] bench/*.[ch] bench/*.cpp))
 SCRIPTS := .ci/run $(wildcard tests/*.sh examples/*.sh bench/*.sh)
 
-.PHONY: all programs deps check-deps demo test stress run-demo run-test run-stress expected-count bench run-bench bench-readme bench-error run-bench-error study-kd run-study-kd study-kd-readme format lint clean help
+.PHONY: all programs deps check-deps demo test stress run-demo run-test run-stress expected-count bench run-bench bench-readme bench-error run-bench-error bench-denoise run-bench-denoise study-kd run-study-kd study-kd-readme format lint clean help
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -325,6 +326,13 @@ bench-error: deps
 
 run-bench-error: $(B)/render $(B)/bench_error
 	@$(B)/bench_error $(PRESET_$(PRESET)) --out out/bench-error-$(PRESET) $(ARGS)
+
+# Second moments with and without denoising: some 5 minutes on two cores; see bench/denoise.sh.
+bench-denoise: deps
+	$(SUB) run-bench-denoise
+
+run-bench-denoise: $(B)/render
+	@mkdir -p out && RENDER=$(B)/render bench/denoise.sh >out/bench-denoise.md && cat out/bench-denoise.md
 
 # Quick: about 10 minutes of one core. Full: half a day.
 study-kd: deps

@@ -87,8 +87,9 @@
      squares of their size around them (phi wraps, poles are crossed), a blur whose width follows the tree. t comes from
      the data: the samples of a leaf are gathered in two halves, and t is what lets each half say most of the other
      (largest sum of mass_other log density), converted to that of both together, t / (2 - t). Trees whose halves agree
-     best without a blur stay as they are. On by default; the idea is that of Nilsson's thesis [Nilsson], whose fixed
-     Gaussians and matrices this does without.
+     best without a blur stay as they are; so do those of second moments whose halves differ by less than one
+     sample a leaf explains (sum of squared differences of shares <= 4 / leaves). On by default; the idea is that of
+     Nilsson's thesis [Nilsson], whose fixed Gaussians and matrices this does without.
      GSD_DENOISE_GAUSSIAN is the method of the thesis (its chapter 4), to compare with. Layers 6, 7, ... of a tree, down
      to its deepest leaf, become matrices 2^layer wide: leaves above a layer are split by area, the subtree below an
      element counts with its sum times 4^-(its depth). Each is blurred by a 7 x 7 Gaussian of desc.gaussian_sigma
@@ -1121,6 +1122,7 @@ GSD_API void gsd_pdf_batch(const gsd_view *view, uint32_t count, const uint32_t 
 #define GSDI_BLUR_EVEN 0.005  /* share of evenness in the density that one half of the samples says of the other */
 #define GSDI_BLUR_MOST 0.6    /* of the way towards the surroundings, for one half */
 #define GSDI_BLUR_STEPS 5     /* halvings of the interval that holds the best blur */
+#define GSDI_BLUR_NOISE 4     /* see gsdi_blur_useful; n samples: 4 leaves / n; tuned on spot, hole, lamps, torus */
 #define GSDI_BLUR_FREE 131072 /* leaves that are blurred whatever the budget */
 #define GSDI_MAX_CELLS (1u << 26)
 
@@ -1776,14 +1778,28 @@ static double gsdi_blur_slope(uint32_t count, const gsdi_blur *b, float t)
     return slope;
 }
 
+/* Whether the halves differ by enough to ask for a blur. Where they agree better, what one says of the other would
+   still ask for it, but only as leaves that it missed look far too dark to it; desc.smoothing has mended those. */
+static bool gsdi_blur_useful(const uint32_t *child, uint32_t count, const gsdi_blur *b)
+{
+    double square = 0, leaves = count - (count - 1) / 4;
+    uint32_t i;
+    for (i = 0; i < count; ++i) {
+        double d = child[i] ? 0 : (double)b->half[0][i] - (double)b->half[1][i];
+        square += d * d;
+    }
+    return square * leaves > GSDI_BLUR_NOISE;
+}
+
 /* Blur the masses of one divided building tree in place. Returns how far they moved towards their surroundings: 0 = not
-   at all, what one half of the samples says of the other would get worse by any blur. */
+   at all: the halves agree as they are, or what one says of the other would get worse by any blur. */
 static double gsdi_blur_tree(const uint32_t *child, const gsdi_sum *sum, const unsigned char *depth, uint32_t count,
                              bool second_moment, gsdi_blur *b)
 {
     double total[3], low = 0, high = GSDI_BLUR_MOST, scale;
     uint32_t i, k;
-    if (!gsdi_blur_masses(child, sum, depth, count, second_moment, b))
+    if (!gsdi_blur_masses(child, sum, depth, count, second_moment, b) ||
+        (second_moment && !gsdi_blur_useful(child, count, b)))
         return 0;
     gsdi_blur_near(child, b, total);
     gsdi_blur_moves(child, depth, count, b, total);

@@ -112,6 +112,28 @@ static void compare(const tree *t, const double *mass, const float *near, double
 
 /* ---- the blur of one tree */
 
+/* Squared differences of the halves' shares, summed over the leaves, times their number. */
+static double halves_noise(const tree *t, bool second)
+{
+    double sum[2] = {0, 0}, square = 0, leaves = 0;
+    for (int pass = 0; pass < 2; ++pass)
+        for (uint32_t i = 0; i < t->count; ++i) {
+            double m[2];
+            for (int k = 0; k < 2; ++k)
+                m[k] = second ? sqrt(t->sum[i].half[k] * pow(0.25, t->depth[i])) : t->sum[i].half[k];
+            if (t->child[i])
+                continue;
+            if (pass == 0) {
+                sum[0] += m[0];
+                sum[1] += m[1];
+                leaves += 1;
+            } else {
+                square += pow(m[0] / sum[0] - m[1] / sum[1], 2);
+            }
+        }
+    return square * leaves;
+}
+
 static void test_surroundings_match_matrices(void **state)
 {
     (void)state;
@@ -155,7 +177,7 @@ static double score(const tree *t, double move)
 static void test_strength_is_where_the_halves_agree_best(void **state)
 {
     (void)state;
-    int moved = 0, still = 0;
+    int moved = 0, still = 0, alike = 0;
     for (uint64_t seed = 1; seed <= 30; ++seed) {
         bool second = seed & 1;
         tree *t = make_tree(seed, 3 + seed % 4, 0.8);
@@ -164,7 +186,14 @@ static void test_strength_is_where_the_halves_agree_best(void **state)
                 t->sum[i].half[k] = pow(t->sum[i].half[0], 1 - (double)(seed % 7) / 6) *
                                     pow(1 + t->sum[i].half[1], (double)(seed % 7) / 6 * (k ? 1 : rnd()));
         measure(t, second);
+        double noise = halves_noise(t, second);
         double best = 0, got = gsdi_blur_tree(t->child, t->sum, t->depth, t->count, second, &t->blur);
+        if (second && noise <= 8) {
+            assert_true(got == 0);
+            ++alike;
+            free(t);
+            continue;
+        }
         for (double at = 0.05; at < 0.6; at += 0.1) { /* the slope by finite differences */
             double slope = gsdi_blur_slope(t->count, &t->blur, (float)at);
             double finite = (score(t, at + 1e-4) - score(t, at - 1e-4)) / 2e-4;
@@ -179,7 +208,7 @@ static void test_strength_is_where_the_halves_agree_best(void **state)
         still += got == 0;
         free(t);
     }
-    assert_true(moved > 5 && still > 3);
+    assert_true(moved > 5 && still > 1 && alike > 1);
 }
 
 static void assert_sane(const tree *t, double total, double strength)
