@@ -512,15 +512,15 @@ static void learning_pays_by_the_trend(void **state)
     assert_true(tr_learning_pays(&t, 10, 10, 0.2));
     t = trend_of(12, -0.5, 0); /* light that is only being found */
     assert_true(tr_learning_pays(&t, 10, 10, 0.3));
-    t = trend_of(4, 0, 0);
+    t = trend_of(5, 0, 0);
     assert_true(tr_learning_pays(&t, 10, 10, 0.9));
 }
 
-/* It looks back to a third of the samples, to five passes at least, and past what is no number. */
+/* It looks back to a third of the samples, to six passes at least, and past what is no number. */
 static void trend_looks_back_so_far(void **state)
 {
     (void)state;
-    tr_trend flat = trend_of(5, 0, 0), steep = trend_of(40, 2, 0);
+    tr_trend flat = trend_of(6, 0, 0), steep = trend_of(40, 2, 0);
     assert_int_equal(steep.count, TR_TREND_MAX);
     for (int i = 0; i < 6; ++i) /* what was learned before is of no interest */
         tr_trend_add(&steep, 1e6 * pow(1.25, i), 1);
@@ -529,14 +529,14 @@ static void trend_looks_back_so_far(void **state)
     tr_trend_add(&flat, 1, NAN);
     tr_trend_add(&flat, 0, 1);
     tr_trend_add(&flat, 30, -1);
-    assert_int_equal(flat.count, 5);
+    assert_int_equal(flat.count, 6);
     tr_trend doubling = {.count = 0};
-    for (int i = 0; i < 5; ++i)
+    for (int i = 0; i < 6; ++i)
         tr_trend_add(&doubling, 1 << i, 1);
     assert_false(tr_learning_pays(&doubling, 10, 10, 0.01));
 }
 
-/* A method that learns nothing and takes as long for it as the samples took. */
+/* A method that learns nothing and takes three times as long for it as the samples took. */
 static struct {
     int taught, rested;
     double start;
@@ -554,9 +554,13 @@ static bool vain_begin(void *method, const tr_pass *pass)
     vain.rested += pass->last;
     return !pass->last;
 }
+static bool vain_record(void *method, int tile, const tr_vertex *vertices, int n)
+{
+    return (void)method, (void)tile, (void)vertices, (void)n, true;
+}
 static bool vain_end(void *method, const tr_pass *pass)
 {
-    double now = tr_cpu_seconds(), until = 2 * now - vain.start;
+    double now = tr_cpu_seconds(), until = now + 3 * (now - vain.start);
     (void)method, (void)pass;
     while (tr_cpu_seconds() < until)
         continue;
@@ -567,20 +571,20 @@ static const tr_method vain_method = {.name = "vain",
                                       .learns = true,
                                       .create = vain_create,
                                       .destroy = even_destroy,
-                                      .record = even_record,
+                                      .record = vain_record,
                                       .begin_pass = vain_begin,
                                       .end_pass = vain_end};
 
-/* Half of every pass goes into learning that lowers no variance: a timed render stops that soon after the eighth of the
-   budget that teaches anyhow, one with a budget of samples goes on to its last pass. */
+/* Three quarters of every pass go into learning that lowers no variance: a timed render stops that soon after the
+   eighth of the budget that teaches anyhow, one with a budget of samples goes on to its last pass. */
 static void learning_in_vain_stops(void **state)
 {
     (void)state;
     tr_scene *scene = load("cornell", NULL, NULL);
     tr_settings s = small("pt", 0);
     s.method = &vain_method;
-    s.width = 24;
-    s.height = 16;
+    s.width = 40;
+    s.height = 24;
     s.max_depth = 3;
     s.seconds = 3;
     s.threads = 1;

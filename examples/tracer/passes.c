@@ -292,7 +292,8 @@ static bool estimate_pixels(render_state *r)
    of a pass's time. Teaching for a moment dt more lowers the variance of all that is left by b dt / spent, and loses c
    dt of the samples: it pays while b left / spent > c. */
 
-#define TREND_LEAST 5   /* passes that make a trend */
+#define TREND_LEAST 6   /* passes that make a trend */
+#define TREND_SURE 2.1  /* standard errors above the slope: 95 % of six passes */
 #define TREND_SPAN 3    /* it looks back to a third of the samples, or to those passes */
 #define TREND_SOONEST 8 /* at least that share of the budget teaches */
 #define TREND_RISE 1.5  /* of variance, at which a field that rests has met new light */
@@ -339,7 +340,7 @@ bool tr_learning_pays(const tr_trend *t, double spent, double left, double share
     double slope, error;
     if (spent * (TREND_SOONEST - 1) < left || !trend_slope(t, &slope, &error))
         return true;
-    return (fabs(slope) + error) * left > share * spent;
+    return (fabs(slope) + TREND_SURE * error) * left > share * spent;
 }
 
 /* What has been spent so far, in all and on learning; workers count wall-clock seconds. */
