@@ -48,7 +48,7 @@ typedef struct render_state {
     int learned;         /* samples per pixel that were learned from */
     double learning_cpu; /* CPU seconds of the passes that taught */
     double learning;     /* share of the last such pass that recording, updating and photons took */
-    double rest;         /* variance of a sample when learning stopped to pay, 0 = it goes on */
+    double rest;         /* variance of a sample when learning no longer paid, 0 = it goes on */
     bool frozen;         /* after the training: one pass that teaches nothing */
     int done;            /* samples per pixel so far, those of the training too */
     double cost;         /* CPU seconds of a sample per pixel in the last pass */
