@@ -2396,8 +2396,8 @@ static void test_gate_weighs_by_pixels(void **state)
         gsd_get_stats(f, &stats);
         if (dark)
             assert_true(stats.closed_cells == 0 && stats.open_cells > 0);
-        else
-            assert_int_equal(stats.closed_cells, stats.cells);
+        else /* a verdict is only 95 % sure: a cell or two may wait for more samples */
+            assert_true(stats.open_cells == 0 && stats.closed_cells >= 0.98 * stats.cells);
         gsd_destroy(f);
     }
 }

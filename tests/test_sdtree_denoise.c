@@ -188,7 +188,7 @@ static void test_strength_is_where_the_halves_agree_best(void **state)
         measure(t, second);
         double noise = halves_noise(t, second);
         double best = 0, got = gsdi_blur_tree(t->child, t->sum, t->depth, t->count, second, &t->blur);
-        if (second && noise <= 8) {
+        if (second && noise <= 4) {
             assert_true(got == 0);
             ++alike;
             free(t);
