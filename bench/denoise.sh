@@ -15,7 +15,8 @@ trap 'rm -rf "$tmp"' EXIT
 
 number() { sed -n "s/.*\"$2\": \[*\([-0-9.e+]*\).*/\1/p" "$1"; }
 
-# compare SCENE TRAIN SEED: a line "train scene all typical share", ratios with half their logarithm's sum.
+# compare SCENE TRAIN SEED: a line "train scene", then the ratios by the samples of either field, of all samples and typical,
+# and the CPU seconds of the step and of the training.
 compare() {
     local file=$1 at=$tmp/$2-$3-$(basename "$1")
     [ -e "$file" ] || file=examples/scenes/$1.xml

@@ -204,7 +204,6 @@ static void samples_follow(const gsd_view *v, const gsd_handle *h, uint32_t n, l
 {
     enum { X = 32, Y = 16, SUB = 64 };
     static double expected[X * Y], seen[X * Y];
-    double chi2 = 0, df = -1, rest = 0, rest_seen = 0;
     memset(seen, 0, sizeof seen);
     for (int k = 0; k < X * Y; ++k) {
         expected[k] = 0;
@@ -223,22 +222,9 @@ static void samples_follow(const gsd_view *v, const gsd_handle *h, uint32_t n, l
         gsd_coordinates(d, &x, &y);
         seen[(y >> 20) * X + (x >> 19)] += 1;
     }
-    for (int k = 0; k < X * Y; ++k) {
-        double e = expected[k], error = 1e-3 * e; /* of the integral */
-        if (e < 20) {
-            rest += e;
-            rest_seen += seen[k];
-            continue;
-        }
-        chi2 += (seen[k] - e) * (seen[k] - e) / (e + error * error);
-        df += 1;
-    }
-    if (rest > 5) {
-        chi2 += (rest_seen - rest) * (rest_seen - rest) / rest;
-        df += 1;
-    }
-    if (chi_square_deviate(chi2, df) > 4.5)
-        fail_msg("chi-square %g at %g degrees of freedom", chi2, df);
+    double off = counts_deviate(expected, seen, X * Y, 1e-3); /* of the integral */
+    if (off > 4.5)
+        fail_msg("counts are %g standard deviations off", off);
 }
 
 static void test_samples_follow_the_density(void **state)
