@@ -584,10 +584,8 @@ GPH_QUERY void gph_see_from(gph_handle *handle, const float position[3])
     }
 }
 
-/* Find what to sample from at a position. normal (NULL or zero = none, the full sphere): unit, on the side of the
-   directions wanted. u (NULL = none): 3 random numbers for a stochastic lookup. [any thread] */
-GPH_QUERY void gph_find(const gph_view *view, const float position[3], const float *normal, const float *u,
-                        gph_handle *handle)
+/* Voxel to sample from at a position; u as in gph_find. */
+GPH_QUERY uint32_t gph_choose_voxel(const gph_view *view, const float position[3], const float *u)
 {
     uint32_t voxel = gph_find_voxel(view, position), near;
     if (u && voxel != GPH_NONE) {
@@ -596,6 +594,13 @@ GPH_QUERY void gph_find(const gph_view *view, const float position[3], const flo
         near = gph_find_voxel(view, moved);
         voxel = near != GPH_NONE && view->voxels[near].map != GPH_NONE ? near : voxel;
     }
+    return voxel;
+}
+
+/* Handle of a voxel, seen from a position, for the surface with this normal. */
+GPH_QUERY void gph_set_place(const gph_view *view, uint32_t voxel, const float position[3], const float *normal,
+                             gph_handle *handle)
+{
     gph_set_voxel(view, voxel, handle);
     gph_see_from(handle, position);
     if (normal && normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2] > 0.5f) {
@@ -604,22 +609,43 @@ GPH_QUERY void gph_find(const gph_view *view, const float position[3], const flo
     }
 }
 
+/* Find what to sample from at a position. normal (NULL or zero = none, the full sphere): unit, on the side of the
+   directions wanted. u (NULL = none): 3 random numbers for a stochastic lookup. [any thread] */
+GPH_QUERY void gph_find(const gph_view *view, const float position[3], const float *normal, const float *u,
+                        gph_handle *handle)
+{
+    gph_set_place(view, gph_choose_voxel(view, position, u), position, normal, handle);
+}
+
 /* A half-float >= 0 as an integer, unit 2^-24: sums of them are exact. */
 GPH_QUERY uint64_t gph_weight(uint16_t half)
 {
-    uint32_t e = half >> 10, m = half & 1023u;
-    return e ? (uint64_t)(1024u | m) << (e - 1) : m;
+    uint32_t e = half >> 10, normal = e != 0;
+    return (uint64_t)(normal << 10 | (half & 1023u)) << (e - normal);
+}
+
+/* Angle of (x, y) in turns, 0 .. 1, within 3e-11. No branches, so that queries overlap, and the same bins with any
+   libm. */
+GPH_QUERY double gph_turn(float x, float y)
+{
+    double ax = fabs((double)x), ay = fabs((double)y), most = ax > ay ? ax : ay, least = ax > ay ? ay : ax;
+    int far = least > most * 0.41421356237309505; /* tan(pi / 8): from there as an angle to the diagonal */
+    double t = (least - (far ? most : 0)) / ((most > 0 ? most : 1) + (far ? least : 0)), z = t * t, a;
+    a = -0.14234379165354208 + z * (0.1053519219492079 + z * -0.05946057042973548);
+    a = t + t * z * (-0.33333302847401997 + z * (0.19997888092958457 + z * a));
+    a = a * 0.15915494309189535 + (far ? 0.125 : 0);
+    a = ay > ax ? 0.25 - a : a;
+    a = x < 0 ? 0.5 - a : a;
+    return y < 0 ? 1 - a : a;
 }
 
 /* Bin of a direction (unit). NaN lands in a bin too. */
 GPH_QUERY uint32_t gph_bin(uint32_t rows, uint32_t columns, const float direction[3])
 {
     float z = (direction[2] + 1) * (0.5f * (float)rows);
-    double phi = (double)atan2f(direction[1], direction[0]), c; /* turns and bins in double: no more rounding */
+    double c = gph_turn(direction[0], direction[1]) * columns; /* in double: no more rounding */
     z = z > 0 ? z : 0;
     z = z < (float)(rows - 1) ? z : (float)(rows - 1);
-    phi = phi < 0 ? phi + 6.28318530717958648 : phi;
-    c = phi * (columns * 0.159154943091895336);
     c = c > 0 ? c : 0;
     c = c < columns - 1 ? c : columns - 1;
     return (uint32_t)z * columns + (uint32_t)c;
@@ -664,19 +690,20 @@ GPH_QUERY double gph_until(const gph_handle *handle, const uint64_t *sums, uint3
            (double)handle->uniform / (double)(handle->rows * handle->columns) * (double)(i * bins);
 }
 
-/* Last of the entries first, ..., first + count - 1 before which lies at most x. */
+/* Last of the entries first, ..., first + count - 1 before which lies at most x. count: a power of two. Three out of
+   four at a time, and without a branch to guess wrong. */
 GPH_QUERY uint32_t gph_search(const gph_handle *handle, const uint64_t *sums, uint32_t first, uint32_t count,
                               uint32_t bins, double x)
 {
-    uint32_t low = first, high = first + count;
-    while (high - low > 1) {
-        uint32_t middle = (low + high) / 2;
-        if (gph_until(handle, sums, middle, bins) <= x)
-            low = middle;
-        else
-            high = middle;
+    uint32_t step = count / 4;
+    for (; step; step /= 4) {
+        uint32_t steps = (uint32_t)(gph_until(handle, sums, first + step, bins) <= x) +
+                         (uint32_t)(gph_until(handle, sums, first + 2 * step, bins) <= x) +
+                         (uint32_t)(gph_until(handle, sums, first + 3 * step, bins) <= x);
+        first += steps * step;
+        count /= 4;
     }
-    return low;
+    return count == 2 ? first + (uint32_t)(gph_until(handle, sums, first + 1, bins) <= x) : first;
 }
 
 /* Where in a bin, 0 .. 1: not on its edges, where rounding would carry a direction into the next bin, whose density may
@@ -687,33 +714,51 @@ GPH_QUERY double gph_inside(double v)
     return v < 1 - 2e-5 ? v : 1 - 2e-5;
 }
 
-/* Direction (unit) from u in [0, 1)^2: as seen from the map's pivot z grows with u[0], and phi with u[1] where z stays
-   in one row of bins (so before mirroring). Returns the density of the direction after rounding. [any thread] */
-GPH_QUERY float gph_sample(const gph_handle *handle, const float u[2], float direction[3])
+/* A direction being drawn: row of bins, then eight of its bins, then a bin. */
+typedef struct gph_draw {
+    uint32_t row, block; /* of eights, in the map */
+    float z;
+    double x; /* what is left of the probability, row and eights found so far included */
+} gph_draw;
+
+/* The row by u[0], for a handle with weights. */
+GPH_QUERY void gph_draw_row(const gph_handle *handle, const float u[2], gph_draw *draw)
 {
-    float z = 2 * u[0] - 1, phi = 2 * GPH_PI * u[1], r;
-    if (handle->weights) {
-        uint32_t blocks = handle->columns / 8, row, block, bin, j;
-        double x, low, mass, part, each = (double)handle->uniform / (double)(handle->rows * handle->columns), p = 0,
-                                   turn;
-        row = gph_search(handle, handle->sums, 0, handle->rows, handle->columns, (double)u[0]);
-        low = gph_until(handle, handle->sums, row, handle->columns);
-        mass = gph_until(handle, handle->sums, row + 1, handle->columns) - low;
-        z = (float)(2 * (row + gph_inside(((double)u[0] - low) / mass)) / handle->rows - 1);
-        x = low + (double)u[1] * mass;
-        block = gph_search(handle, handle->blocks, row * blocks, blocks, 8, x);
-        part = x - gph_until(handle, handle->blocks, block, 8);
-        for (j = 0; j < 8; ++j) {
-            p = handle->share * (double)gph_weight(handle->weights[block * 8 + j]) + each;
-            if (part < p || j == 7)
-                break;
-            part -= p;
-        }
-        bin = block * 8 + j - row * handle->columns;
-        turn = (bin + gph_inside(part / p)) / handle->columns;
-        phi = (float)(6.28318530717958648 * (turn < 0.5 ? turn : turn - 1)); /* -pi .. pi: floats are finer there */
+    double low, mass;
+    draw->row = gph_search(handle, handle->sums, 0, handle->rows, handle->columns, (double)u[0]);
+    low = gph_until(handle, handle->sums, draw->row, handle->columns);
+    mass = gph_until(handle, handle->sums, draw->row + 1, handle->columns) - low;
+    draw->z = (float)(2 * (draw->row + gph_inside(((double)u[0] - low) / mass)) / handle->rows - 1);
+    draw->x = low + (double)u[1] * mass;
+}
+
+GPH_QUERY void gph_draw_block(const gph_handle *handle, gph_draw *draw)
+{
+    uint32_t blocks = handle->columns / 8;
+    draw->block = gph_search(handle, handle->blocks, draw->row * blocks, blocks, 8, draw->x);
+    draw->x -= gph_until(handle, handle->blocks, draw->block, 8);
+}
+
+/* The bin, and phi, -pi .. pi: floats are finer there. */
+GPH_QUERY float gph_draw_phi(const gph_handle *handle, const gph_draw *draw)
+{
+    const uint16_t *weights = handle->weights + draw->block * 8;
+    double each = (double)handle->uniform / (double)(handle->rows * handle->columns), until = 0, low = 0, turn;
+    uint32_t j, in = 0;
+    for (j = 0; j < 7; ++j) {
+        until += handle->share * (double)gph_weight(weights[j]) + each;
+        in += (uint32_t)(until <= draw->x);
+        low = until <= draw->x ? until : low;
     }
-    r = 1 - z * z;
+    turn = gph_inside((draw->x - low) / (handle->share * (double)gph_weight(weights[in]) + each));
+    turn = (draw->block * 8 + in - draw->row * handle->columns + turn) / handle->columns;
+    return (float)(6.28318530717958648 * (turn < 0.5 ? turn : turn - 1));
+}
+
+/* The direction, seen from the handle's position and above its surface. Returns its density. */
+GPH_QUERY float gph_draw_end(const gph_handle *handle, float z, float phi, float direction[3])
+{
+    float r = 1 - z * z;
     r = sqrtf(r > 0 ? r : 0);
     direction[0] = r * cosf(phi);
     direction[1] = r * sinf(phi);
@@ -726,6 +771,18 @@ GPH_QUERY float gph_sample(const gph_handle *handle, const float u[2], float dir
         memcpy(direction, other, sizeof other);
     }
     return gph_pdf(handle, direction);
+}
+
+/* Direction (unit) from u in [0, 1)^2: as seen from the map's pivot z grows with u[0], and phi with u[1] where z stays
+   in one row of bins (so before mirroring). Returns the density of the direction after rounding. [any thread] */
+GPH_QUERY float gph_sample(const gph_handle *handle, const float u[2], float direction[3])
+{
+    gph_draw draw;
+    if (!handle->weights)
+        return gph_draw_end(handle, 2 * u[0] - 1, 2 * GPH_PI * u[1], direction);
+    gph_draw_row(handle, u, &draw);
+    gph_draw_block(handle, &draw);
+    return gph_draw_end(handle, draw.z, gph_draw_phi(handle, &draw), direction);
 }
 
 /* Sides of the axes that a surface with this normal (unit) shows to: bits of -x, +x, -y, ... Never two opposite ones.
@@ -3372,26 +3429,39 @@ static const float *gphi_row(const float *rows, size_t stride, uint32_t i)
     return (const float *)(const void *)((const char *)rows + stride * i);
 }
 
+static uint32_t gphi_at(const uint32_t *index, uint32_t k) { return index ? index[k] : k; }
+
+/* Maps lie anywhere in memory: a group's queries ask for what each will read next, then go on together. */
+
 GPH_API void gph_find_batch(const gph_view *view, uint32_t count, const uint32_t *index, const float *positions,
                             size_t position_stride, const float *normals, size_t normal_stride, const float *u,
                             size_t u_stride, gph_handle *handles, float *alpha)
 {
-    uint32_t begin, k;
-    for (begin = 0; begin < count; begin += GPHI_GROUP) {
-        uint32_t n = count - begin < GPHI_GROUP ? count - begin : GPHI_GROUP;
-        for (k = 0; k < n; ++k) { /* the table lies anywhere in memory: fetch a group's slots together */
-            uint32_t i = index ? index[begin + k] : begin + k, slot;
-            slot =
-                gph_hash_key(gph_cube_key(view->origin, view->inverse_side, gphi_row(positions, position_stride, i))) &
-                view->mask;
+    uint32_t voxels[GPHI_GROUP], begin, k, n;
+    for (begin = 0; begin < count; begin += n) {
+        n = count - begin < GPHI_GROUP ? count - begin : GPHI_GROUP;
+        for (k = 0; k < n; ++k) {
+            const float *p = gphi_row(positions, position_stride, gphi_at(index, begin + k));
+            uint32_t slot = gph_hash_key(gph_cube_key(view->origin, view->inverse_side, p)) & view->mask;
             GPHI_PREFETCH(&view->keys[slot]);
             GPHI_PREFETCH(&view->roots[slot]);
         }
         for (k = 0; k < n; ++k) {
-            uint32_t i = index ? index[begin + k] : begin + k;
-            gph_find(view, gphi_row(positions, position_stride, i),
-                     normals ? gphi_row(normals, normal_stride, i) : NULL, u ? gphi_row(u, u_stride, i) : NULL,
-                     &handles[i]);
+            uint32_t i = gphi_at(index, begin + k);
+            voxels[k] =
+                gph_choose_voxel(view, gphi_row(positions, position_stride, i), u ? gphi_row(u, u_stride, i) : NULL);
+            if (voxels[k] != GPH_NONE)
+                GPHI_PREFETCH(&view->voxels[voxels[k]]);
+        }
+        for (k = 0; k < n; ++k) {
+            uint32_t map = voxels[k] == GPH_NONE ? GPH_NONE : view->voxels[voxels[k]].map, r;
+            for (r = 0; map != GPH_NONE && r < view->rows + 8; r += 8)
+                GPHI_PREFETCH((const uint64_t *)(const void *)(view->maps + (size_t)map * view->map_bytes) + r);
+        }
+        for (k = 0; k < n; ++k) {
+            uint32_t i = gphi_at(index, begin + k);
+            gph_set_place(view, voxels[k], gphi_row(positions, position_stride, i),
+                          normals ? gphi_row(normals, normal_stride, i) : NULL, &handles[i]);
             if (alpha)
                 alpha[i] = handles[i].alpha;
         }
@@ -3401,14 +3471,33 @@ GPH_API void gph_find_batch(const gph_view *view, uint32_t count, const uint32_t
 GPH_API void gph_sample_batch(const gph_view *view, uint32_t count, const uint32_t *index, const gph_handle *handles,
                               const float *u, size_t u_stride, float *directions, size_t direction_stride, float *pdf)
 {
-    uint32_t k, j;
-    for (k = 0; k < count; ++k) {
-        uint32_t i = index ? index[k] : k, ahead = k + 6 < count ? (index ? index[k + 6] : k + 6) : i;
-        if (handles[ahead].weights) /* maps lie anywhere in memory */
-            for (j = 0; j <= view->rows; j += 8)
-                GPHI_PREFETCH(handles[ahead].sums + j);
-        pdf[i] = gph_sample(&handles[i], gphi_row(u, u_stride, i),
-                            (float *)(void *)((char *)directions + direction_stride * i));
+    gph_draw draws[GPHI_GROUP];
+    uint32_t begin, k, n;
+    (void)view;
+    for (begin = 0; begin < count; begin += n) {
+        n = count - begin < GPHI_GROUP ? count - begin : GPHI_GROUP;
+        for (k = 0; k < n; ++k) {
+            const gph_handle *h = &handles[gphi_at(index, begin + k)];
+            if (!h->weights)
+                continue;
+            gph_draw_row(h, gphi_row(u, u_stride, gphi_at(index, begin + k)), &draws[k]);
+            GPHI_PREFETCH(h->blocks + draws[k].row * (h->columns / 8));
+        }
+        for (k = 0; k < n; ++k) {
+            const gph_handle *h = &handles[gphi_at(index, begin + k)];
+            if (!h->weights)
+                continue;
+            gph_draw_block(h, &draws[k]);
+            GPHI_PREFETCH(h->weights + draws[k].block * 8);
+        }
+        for (k = 0; k < n; ++k) {
+            uint32_t i = gphi_at(index, begin + k);
+            const float *x = gphi_row(u, u_stride, i);
+            bool drawn = handles[i].weights != NULL;
+            float z = drawn ? draws[k].z : 2 * x[0] - 1;
+            float phi = drawn ? gph_draw_phi(&handles[i], &draws[k]) : 2 * GPH_PI * x[1];
+            pdf[i] = gph_draw_end(&handles[i], z, phi, (float *)(void *)((char *)directions + direction_stride * i));
+        }
     }
 }
 
@@ -3418,7 +3507,7 @@ GPH_API void gph_pdf_batch(const gph_view *view, uint32_t count, const uint32_t 
     uint32_t k;
     (void)view;
     for (k = 0; k < count; ++k) {
-        uint32_t i = index ? index[k] : k;
+        uint32_t i = gphi_at(index, k);
         pdf[i] = gph_pdf(&handles[i], gphi_row(directions, direction_stride, i));
     }
 }

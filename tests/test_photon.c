@@ -367,6 +367,28 @@ static void test_samples_at_the_edges_of_bins_stay_inside(void **state)
     }
 }
 
+static void test_turns_and_weights_are_exact(void **state)
+{
+    (void)state;
+    seed(60);
+    for (int i = 0; i < 200000; ++i) {
+        double size = ldexp(1, (int)(rnd() * 60) - 50), phi = (rnd() - 0.5) * 2 * PI;
+        float x = (float)(size * cos(phi)), y = (float)(size * sin(phi));
+        double exact = atan2((double)y, (double)x) / (2 * PI);
+        assert_true(fabs(gph_turn(x, y) - (exact < 0 ? exact + 1 : exact)) < 3e-11);
+    }
+    const float axes[8][2] = {{1, 0}, {1, 1}, {0, 1}, {-1, 1}, {-1, 0}, {-1, -1}, {0, -1}, {1, -1}};
+    for (int i = 0; i < 8; ++i)
+        assert_true(fabs(gph_turn(axes[i][0], axes[i][1]) - i / 8.0) < 3e-11);
+    assert_true(gph_turn(0, 0) == 0);
+    const float nowhere[3] = {NAN, NAN, NAN};
+    assert_true(gph_bin(32, 64, nowhere) < 32 * 64);
+    for (int h = 0; h < 0x7c00; ++h) { /* half-floats in units of 2^-24 */
+        double exact = h < 1024 ? h : ldexp(1024 + (h & 1023), (h >> 10) - 1);
+        assert_true((double)gph_weight((uint16_t)h) == exact);
+    }
+}
+
 static void test_sampling_is_monotone_in_u(void **state)
 {
     (void)state;
@@ -1870,6 +1892,7 @@ int main(void)
         cmocka_unit_test(test_with_a_normal_it_integrates_to_one_over_the_upper_side),
         cmocka_unit_test(test_samples_follow_the_density),
         cmocka_unit_test(test_samples_at_the_edges_of_bins_stay_inside),
+        cmocka_unit_test(test_turns_and_weights_are_exact),
         cmocka_unit_test(test_sampling_is_monotone_in_u),
         cmocka_unit_test(test_sides_that_nobody_sees_take_no_photons),
         cmocka_unit_test(test_a_known_distribution_is_recovered),
