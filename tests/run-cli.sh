@@ -385,6 +385,7 @@ done
 refuses 'train_histogram: unknown option' 'frobnicate: unknown' --frobnicate 1
 refuses 'train_histogram: option without its value' 'seed: .*without its value' --seed
 refuses 'train_histogram: --scene with --data' 'scene: .*leave out --data' --scene good.xml --data absent
+refuses 'train_histogram: weights of a network without inputs' 'features 0: .*leave out --weights' --features 0 --weights half
 
 # A data set by hand: one map to train, one held out, all values alike. safetensors are a length, JSON, numbers.
 data_set() { # data_set FILE RUN

@@ -28,7 +28,7 @@ enum { MAX_DATA = 8 };
 typedef struct options {
     const char *data[MAX_DATA], *scene, *checkpoint, *weights, *curve;
     int data_count;
-    double rooms, room_seconds, seconds, steps, seed, threads, batch, rate, lambda, deep;
+    double rooms, room_seconds, seconds, steps, seed, threads, batch, rate, lambda, deep, features;
     uint32_t channels[GNN_MAX_LEVELS];
 } options;
 
@@ -308,6 +308,7 @@ typedef struct set {
     float *maps;    /* [capacity][planes][PN_AREA] */
     float *photons; /* [capacity][2]: of the input, of the truth */
     uint32_t count, capacity, planes;
+    bool histogram_only; /* the network is shown S_t alone */
 } set;
 
 static void set_reserve(set *s, uint32_t capacity)
@@ -777,6 +778,8 @@ static void load_example(const set *s, uint32_t i, uint32_t change, float *input
     for (int k = 0; k < PN_AREA; ++k)
         e.features[4 * PN_AREA + k] = e.features[2 * PN_AREA + k] > 0 ? 1.0f : 0.0f;
     pn_inputs(e.repaired, e.features, s->photons[2 * (size_t)i], inputs);
+    if (s->histogram_only) /* S_t and its blur are left */
+        memset(inputs + 2 * PN_AREA, 0, 4 * PN_AREA * sizeof *inputs);
     if (!target)
         return;
     transform(maps + TRUTH_A * PN_AREA, change, e.truth);
@@ -895,6 +898,37 @@ static void judge_plane(const set *s, int plane, float low, float high, tally *t
     for (uint32_t i = 0; i < s->count; ++i)
         if (s->photons[2 * (size_t)i] >= low && s->photons[2 * (size_t)i] < high)
             add_score(t, judge(set_map(s, i), set_map(s, i) + (size_t)plane * PN_AREA));
+}
+
+/* Bins around in reach, with less weight the further they are and the more their square roots differ: by twice what
+   chance makes of them, where photons are of one weight (Anscombe 1948). */
+static void bilateral(const float *map, double photons, float *out)
+{
+    enum { REACH = 4 };
+    const double across = 1.4, apart = 2 * 0.5 * sqrt(PN_AREA / fmax(photons, 1));
+    for (int y = 0; y < PN_ROWS; ++y)
+        for (int x = 0; x < PN_COLUMNS; ++x) {
+            double sum = 0, all = 0, here = sqrt((double)map[y * PN_COLUMNS + x]);
+            for (int j = -REACH; j <= REACH; ++j)
+                for (int i = -REACH; i <= REACH && y + j >= 0 && y + j < PN_ROWS; ++i) {
+                    double there = (double)map[(y + j) * PN_COLUMNS + (x + i + PN_COLUMNS) % PN_COLUMNS];
+                    double d = (sqrt(there) - here) / apart,
+                           w = exp(-0.5 * (d * d + (i * i + j * j) / (across * across)));
+                    sum += w * there;
+                    all += w;
+                }
+            out[y * PN_COLUMNS + x] = (float)(sum / all);
+        }
+}
+
+static void judge_bilateral(const set *s, tally *t)
+{
+    float map[PN_AREA];
+    memset(t, 0, sizeof *t);
+    for (uint32_t i = 0; i < s->count; ++i) {
+        bilateral(set_map(s, i) + FEATURES * PN_AREA, (double)s->photons[2 * (size_t)i], map);
+        add_score(t, judge(set_map(s, i), map));
+    }
 }
 
 /* ---- >>train ------------------------------------------------------------------------------------------------ */
@@ -1060,6 +1094,8 @@ static void report(runner *r, const set *held, bool trained)
         judge_plane(held, k, 0, 1e9f, &t);
         print_tally(filter_names[k - TRAIN_PLANES], &t);
     }
+    judge_bilateral(held, &t);
+    print_tally("bilateral", &t);
     if (!trained)
         return;
     judge_net(r, held, 0, 1e9f, 1, &t, &loss);
@@ -1087,7 +1123,8 @@ static const char usage[] =
     "  --checkpoint FILE    written while training; where it is there, training goes on from it "
     "(histogram.checkpoint)\n"
     "  --weights FILE       half-float weights, written at the end     --curve FILE.svg  losses over time\n"
-    "  --seed N  --threads N  --batch N (16)  --rate R (0.002)  --lambda L  --deep W  --channels A,B,...\n";
+    "  --seed N  --threads N  --batch N (16)  --rate R (0.002)  --lambda L  --deep W  --channels A,B,...\n"
+    "  --features 0         what S_t-1, P_t, P_t-1 and B_t are worth: without them\n";
 
 /* A,B,...: one to six whole numbers of 1 .. 512. */
 static bool parse_channels(const char *text, uint32_t channels[GNN_MAX_LEVELS])
@@ -1125,7 +1162,8 @@ static bool set_number(options *o, const char *key, const char *value)
                    {"--seconds", &o->seconds, 0, 1e8, false}, {"--steps", &o->steps, 0, 1e9, true},
                    {"--seed", &o->seed, 0, 1e9, true},        {"--threads", &o->threads, 1, 256, true},
                    {"--batch", &o->batch, 1, 1024, true},     {"--rate", &o->rate, 0, 1, false},
-                   {"--lambda", &o->lambda, 0, 1000, false},  {"--deep", &o->deep, 0, 1000, false}};
+                   {"--lambda", &o->lambda, 0, 1000, false},  {"--deep", &o->deep, 0, 1000, false},
+                   {"--features", &o->features, 0, 1, true}};
     for (size_t k = 0; k < sizeof numbers / sizeof *numbers; ++k)
         if (!strcmp(key, numbers[k].key)) {
             char *end;
@@ -1172,6 +1210,8 @@ static void parse_options(options *o, int argc, char **argv)
         die("--scene", "is judged on maps of its own: leave out --data");
     if (o->weights && !strcmp(o->weights, o->checkpoint))
         die("--weights", "would be written over the checkpoint");
+    if (o->weights && !o->features)
+        die("--features 0", "makes no network to use: leave out --weights");
 }
 
 static gnn_unet *make_net(const options *o)
@@ -1199,6 +1239,7 @@ int main(int argc, char **argv)
                  .threads = 1,
                  .batch = 16,
                  .rate = 0.002,
+                 .features = 1,
                  .checkpoint = "histogram.checkpoint"};
     set sets[2] = {{.planes = TRAIN_PLANES}, {.planes = HELD_PLANES}};
     state s = {0, 0, 0, 0};
@@ -1209,6 +1250,7 @@ int main(int argc, char **argv)
     }
     parse_options(&o, argc, argv);
     get_data(&o, sets);
+    sets[0].histogram_only = sets[1].histogram_only = o.features == 0;
     printf("%u maps to train, %u held out\n", sets[0].count, sets[1].count);
     if ((!sets[0].count && !o.scene) || !sets[1].count)
         die("data", "too few rooms had enough light: make other data, with more --rooms or --room-seconds");
