@@ -1117,6 +1117,7 @@ GKD_API void gkd_pdf_directions(const gkd_view *view, const gkd_handle *handle, 
 #if !defined(GKD_NO_SIMD) && (defined(__GNUC__) || defined(__clang__)) && defined(__x86_64__)
 #define GKDI_X86 1
 #include <immintrin.h>
+#define GKDI_EXACT __attribute__((target("avx2"))) /* no fma: for what has the same bits at every level */
 #else
 #define GKDI_X86 0
 #endif
@@ -1255,6 +1256,46 @@ typedef struct gkdi_sum {
     double lit, away[3], square[3];             /* non-zero samples, their positions from a reference point */
 } gkdi_sum;
 
+#if GKDI_X86
+/* gkdi_sum_items; lanes are sums, so that each is added up in the same order. */
+GKDI_EXACT static void gkdi_sum_items_avx2(gkdi_sum *sum, gkdi_shape *shape, const double from[3],
+                                           const gkdi_item *items, const uint32_t *list, uint32_t count)
+{
+    const __m256d pivot = _mm256_setr_pd(from[0], from[1], from[2], 0);
+    __m256d away = _mm256_setzero_pd(), square = away, light = away, squares = away, products = away;
+    double out[5][4];
+    uint32_t i, k;
+    for (i = 0; i < count; ++i) {
+        const gkdi_item *p = &items[list[i]];
+        __m256d x = _mm256_sub_pd(_mm256_cvtps_pd(_mm_loadu_ps(p->position)), pivot); /* the fourth is not used */
+        __m256d v = _mm256_set1_pd((double)p->weight);
+        away = _mm256_add_pd(away, x);
+        square = _mm256_add_pd(square, _mm256_mul_pd(x, x));
+        x = _mm256_cvtps_pd(_mm_blend_ps(_mm_loadu_ps(p->direction), _mm_set1_ps(1), 8));
+        x = _mm256_mul_pd(x, v);
+        light = _mm256_add_pd(light, x);
+        squares = _mm256_add_pd(squares, _mm256_mul_pd(x, x));
+        products = _mm256_add_pd(products, _mm256_mul_pd(x, _mm256_permute4x64_pd(x, 0xc9))); /* xy yz zx */
+    }
+    _mm256_storeu_pd(out[0], away);
+    _mm256_storeu_pd(out[1], square);
+    _mm256_storeu_pd(out[2], light);
+    _mm256_storeu_pd(out[3], squares);
+    _mm256_storeu_pd(out[4], products);
+    sum->sum += out[2][3];
+    sum->squares += out[3][3];
+    for (k = 0; k < 3; ++k) {
+        sum->away[k] += out[0][k];
+        sum->square[k] += out[1][k];
+        sum->direction[k] += out[2][k];
+        shape->s[k] += out[3][k];
+    }
+    shape->s[3] += out[4][0];
+    shape->s[4] += out[4][2];
+    shape->s[5] += out[4][1];
+}
+#endif
+
 /* Add the light of items[list[0 .. count - 1]], all of them non-zero. */
 static void gkdi_sum_light(gkdi_sum *sum, gkdi_shape *shape, const gkdi_item *items, const uint32_t *list,
                            uint32_t count)
@@ -1277,7 +1318,6 @@ static void gkdi_sum_light(gkdi_sum *sum, gkdi_shape *shape, const gkdi_item *it
         s[4] += x * z;
         s[5] += y * z;
     }
-    sum->samples += count;
     sum->sum += light[0];
     sum->squares += light[1];
     for (k = 0; k < 3; ++k)
@@ -1300,11 +1340,28 @@ static void gkdi_sum_places(gkdi_sum *sum, const double from[3], const gkdi_item
             square[k] += x * x;
         }
     }
-    sum->lit += count;
     for (k = 0; k < 3; ++k) {
         sum->away[k] += away[k];
         sum->square[k] += square[k];
     }
+}
+
+/* Add items[list[0 .. count - 1]], all of them non-zero: their light, and their positions as seen from a reference
+   point. */
+static void gkdi_sum_items(uint32_t simd, gkdi_sum *sum, gkdi_shape *shape, const double from[3],
+                           const gkdi_item *items, const uint32_t *list, uint32_t count)
+{
+    sum->samples += count;
+    sum->lit += count;
+#if GKDI_X86
+    if (simd > GKD_SIMD_SCALAR) {
+        gkdi_sum_items_avx2(sum, shape, from, items, list, count);
+        return;
+    }
+#endif
+    (void)simd;
+    gkdi_sum_light(sum, shape, items, list, count);
+    gkdi_sum_places(sum, from, items, list, count);
 }
 
 static void gkdi_sum_add(gkdi_sum *sum, const gkdi_sum *other)
@@ -2019,6 +2076,7 @@ typedef struct gkdi_view {
 } gkdi_view;
 
 #if GKDI_VECTORS
+typedef float gkdi_v4 __attribute__((vector_size(16)));
 typedef float gkdi_v8 __attribute__((vector_size(32)));
 typedef int32_t gkdi_i8 __attribute__((vector_size(32)));
 #define GKDI_INLINE static inline __attribute__((always_inline))
@@ -2031,7 +2089,10 @@ typedef struct gkdi_chunk {
 
 GKDI_INLINE float gkdi_add_lanes(const gkdi_v8 *v)
 {
-    return (((*v)[0] + (*v)[4]) + ((*v)[2] + (*v)[6])) + (((*v)[1] + (*v)[5]) + ((*v)[3] + (*v)[7]));
+    gkdi_v4 half[2];
+    memcpy(half, v, sizeof half);
+    half[0] += half[1];
+    return (half[0][0] + half[0][2]) + (half[0][1] + half[0][3]);
 }
 
 /* 1 / sqrt(v) for v in [1e-4, 1e30]: the exponent halved, then three Newton steps (rounded alike everywhere, and
@@ -2044,6 +2105,35 @@ GKDI_INLINE void gkdi_inverse_sqrt(gkdi_v8 *v)
     *v = y * (1.5f - half * y * y);
 }
 
+/* Items become columns, up to a multiple of eight; past the end: the last one with weight 0. */
+GKDI_INLINE void gkdi_turn(const gkdi_item *items, uint32_t n, uint32_t stride, float (*column)[GKDI_CHUNK])
+{
+    uint32_t i = 0, k;
+#if GKDI_X86
+    for (; i + 4 <= n; i += 4)
+        for (k = 0; k < 8; k += 4) {
+            const float *p = (const float *)(const void *)(items + (size_t)i * stride) + k;
+            size_t row = stride * (sizeof *items / sizeof *p);
+            __m128 a = _mm_loadu_ps(p), b = _mm_loadu_ps(p + row);
+            __m128 c = _mm_loadu_ps(p + 2 * row), d = _mm_loadu_ps(p + 3 * row);
+            _MM_TRANSPOSE4_PS(a, b, c, d);
+            _mm_storeu_ps(column[k] + i, a);
+            _mm_storeu_ps(column[k + 1] + i, b);
+            _mm_storeu_ps(column[k + 2] + i, c);
+            _mm_storeu_ps(column[k + 3] + i, d);
+        }
+#endif
+    for (; i < (n + 7) / 8 * 8; ++i) {
+        const gkdi_item *p = items + (size_t)(i < n ? i : n - 1) * stride;
+        for (k = 0; k < 3; ++k) {
+            column[k][i] = p->position[k];
+            column[3 + k][i] = p->direction[k];
+        }
+        column[6][i] = p->nearness;
+        column[7][i] = i < n ? p->weight : 0;
+    }
+}
+
 /* From the pivot the point x + w / nearness is in direction w + nearness (x - pivot); with len its length, nearness
    there is nearness / len and a patch's solid angle is 1 / len^2 as large (facing alike; own, [Ruppert 2020] keeps
    it). No division by nearness, so 0 needs no case. Where the point is at the pivot or numbers overflow the direction
@@ -2051,23 +2141,13 @@ GKDI_INLINE void gkdi_inverse_sqrt(gkdi_v8 *v)
 GKDI_INLINE void gkdi_load(const gkdi_item *items, uint32_t n, const gkdi_view *view, gkdi_chunk *c)
 {
     const gkdi_v8 zero = {0};
+    float column[8][GKDI_CHUNK];
     c->groups = (n + 7) / 8;
+    gkdi_turn(items, n, view->stride, column);
     for (uint32_t g = 0; g < c->groups; ++g) {
-        float in[8][8];
         gkdi_v8 v[8];
-        for (uint32_t j = 0; j < 8; ++j) { /* past the end: the last one with weight 0 */
-            uint32_t i = 8 * g + j;
-            const gkdi_item *p = items + (size_t)(i < n ? i : n - 1) * view->stride;
-            in[0][j] = p->position[0];
-            in[1][j] = p->position[1];
-            in[2][j] = p->position[2];
-            in[3][j] = p->direction[0];
-            in[4][j] = p->direction[1];
-            in[5][j] = p->direction[2];
-            in[6][j] = p->nearness;
-            in[7][j] = i < n ? p->weight : 0;
-        }
-        memcpy(v, in, sizeof v);
+        for (uint32_t k = 0; k < 8; ++k)
+            memcpy(&v[k], column[k] + 8 * g, sizeof v[k]);
         v[6] = GKDI_SELECT(v[6] < view->nearest, v[6], zero + view->nearest);
         gkdi_v8 x = v[3] + v[6] * (v[0] - view->pivot[0]), y = v[4] + v[6] * (v[1] - view->pivot[1]),
                 z = v[5] + v[6] * (v[2] - view->pivot[2]), inverse = x * x + y * y + z * z, w;
@@ -3323,11 +3403,14 @@ static uint32_t gkdi_look_room(const gkd_desc *desc, uint32_t count)
 static uint32_t gkdi_cut_items(gkdi_cell_samples *batch, uint32_t begin, uint32_t end, uint32_t axis, float split)
 {
     uint32_t i, low = begin, high = 0;
-    for (i = begin; i < end; ++i)
-        if (batch->items[i].position[axis] < split)
-            batch->items[low++] = batch->items[i];
-        else
-            batch->other_items[high++] = batch->items[i];
+    for (i = begin; i < end; ++i) { /* no branch: it could not be predicted */
+        gkdi_item item = batch->items[i];
+        bool above = !(item.position[axis] < split);
+        batch->items[low] = item;
+        batch->other_items[high] = item;
+        low += !above;
+        high += above;
+    }
     memcpy(batch->items + low, batch->other_items, high * sizeof *batch->items);
     return low;
 }
@@ -3335,7 +3418,7 @@ static uint32_t gkdi_cut_items(gkdi_cell_samples *batch, uint32_t begin, uint32_
 static uint32_t gkdi_cut_zeros(gkdi_cell_samples *batch, uint32_t begin, uint32_t end, uint32_t axis, float split)
 {
     uint32_t i, low = begin, high = 0;
-    for (i = begin; i < end; ++i) { /* no branch: it could not be predicted */
+    for (i = begin; i < end; ++i) {
         float zero[3];
         bool above = !(batch->zeros[i][axis] < split);
         memcpy(zero, batch->zeros[i], sizeof zero);
@@ -3368,8 +3451,7 @@ static void gkdi_look_take_in(const gkdi_feeder *f, gkd_signature *s, gkdi_porti
     uint32_t items = (double)p->count < most ? p->count : (uint32_t)most, zeros = p->end - p->begin;
     gkdi_sum part;
     memset(&part, 0, sizeof part);
-    gkdi_sum_light(&part, &f->cell->shape, f->batch->items, p->list, items);
-    gkdi_sum_places(&part, f->from, f->batch->items, p->list, items);
+    gkdi_sum_items((uint32_t)f->desc->simd, &part, &f->cell->shape, f->from, f->batch->items, p->list, items);
     most -= items;
     zeros = (double)zeros < most ? zeros : (uint32_t)most;
     part.samples += zeros;
@@ -3395,19 +3477,70 @@ static bool gkdi_look_divide(gkdi_cell *c, gkd_signature *s)
     return true;
 }
 
+#if GKDI_X86
+/* Those of four lanes whose bits are set in a mask, in front. */
+GKDI_EXACT static inline __m128i gkdi_front4(__m128i lanes, uint32_t mask)
+{
+    static const uint32_t order[16] = {0, 0,        1,        0x000100, 2,        0x000200, 0x000201, 0x020100,
+                                       3, 0x000300, 0x000301, 0x030100, 0x000302, 0x030200, 0x030201, 0x03020100};
+    __m128i at = _mm_cvtepu8_epi32(_mm_cvtsi32_si128((int)order[mask]));
+    return _mm_castps_si128(_mm_permutevar_ps(_mm_castsi128_ps(lanes), at));
+}
+
+/* gkdi_list_cut of a multiple of eight. */
+GKDI_EXACT static uint32_t gkdi_list_cut_avx2(const float *places, float split, uint32_t *list, uint32_t count,
+                                              uint32_t *other)
+{
+    uint32_t i, k, low = 0, up = 0;
+    for (i = 0; i < count; i += 8) {
+        __m256i at = _mm256_loadu_si256((const __m256i *)(const void *)(list + i));
+        __m256 x = _mm256_i32gather_ps(places, _mm256_slli_epi32(at, 3), 4); /* floats of a gkdi_item: 2^3 */
+        uint32_t above = (uint32_t)_mm256_movemask_ps(_mm256_cmp_ps(x, _mm256_set1_ps(split), _CMP_NLT_UQ));
+        for (k = 0; k < 2; ++k, above >>= 4) {
+            __m128i four = k ? _mm256_extracti128_si256(at, 1) : _mm256_castsi256_si128(at);
+            uint32_t n = (uint32_t)__builtin_popcount(above & 15);
+            _mm_storeu_si128((__m128i *)(void *)(list + low), gkdi_front4(four, ~above & 15));
+            _mm_storeu_si128((__m128i *)(void *)(other + up), gkdi_front4(four, above & 15));
+            low += 4 - n;
+            up += n;
+        }
+    }
+    return low;
+}
+#endif
+
+/* Stable partition of a list of items by a plane, places = items[0].position + axis: what lies above goes to other. How
+   many are left. */
+static uint32_t gkdi_list_cut(uint32_t simd, const float *places, float split, uint32_t *list, uint32_t count,
+                              uint32_t *other)
+{
+    uint32_t i = 0, low = 0, up = 0;
+#if GKDI_X86
+    if (simd > GKD_SIMD_SCALAR) {
+        i = count & ~7u;
+        low = gkdi_list_cut_avx2(places, split, list, i, other);
+        up = i - low;
+    }
+#endif
+    (void)simd;
+    for (; i < count; ++i) { /* no branch: it could not be predicted */
+        uint32_t at = list[i];
+        bool above = !(places[at * (sizeof(gkdi_item) / sizeof(float))] < split);
+        list[low] = other[up] = at;
+        up += above;
+        low += !above;
+    }
+    return low;
+}
+
 /* Stable partition of a portion by the plane of a lookahead cell: what lies below is left in it, the rest returned. */
 static gkdi_portion gkdi_portion_cut(const gkdi_feeder *f, const gkd_signature *s, gkdi_portion *p)
 {
     gkdi_portion high;
-    const gkdi_item *items = f->batch->items;
-    uint32_t i, low = 0, up = 0, *other = f->batch->other_list;
-    for (i = 0; i < p->count; ++i) { /* no branch: it could not be predicted */
-        uint32_t at = p->list[i];
-        bool above = !(items[at].position[s->axis] < s->split);
-        p->list[low] = other[up] = at;
-        up += above;
-        low += !above;
-    }
+    uint32_t *other = f->batch->other_list;
+    uint32_t low = gkdi_list_cut((uint32_t)f->desc->simd, f->batch->items[0].position + s->axis, s->split, p->list,
+                                 p->count, other);
+    uint32_t up = p->count - low;
     memcpy(p->list + low, other, up * sizeof *other);
     high.list = p->list + low;
     high.count = up;
@@ -3752,7 +3885,7 @@ static void gkdi_take_samples(const gkdi_update *u, const gkdi_outcome *o, gkdi_
     const gkd_desc *desc = &u->field->desc;
     gkd_view view = gkd_get_view(u->field);
     bool judge = !desc->no_gate && !desc->no_mixtures && (c->gate.verdict != GKD_GATE_CLOSED || c->gate.probe == 0);
-    uint32_t i, items = 0, zeros = 0;
+    uint32_t i, k, items = 0, zeros = 0;
     for (i = o->first; i < o->end; ++i) {
         const gkd_training_sample *s = &u->samples[u->order[i]];
         const gkd_training_sample *soon = &u->samples[u->order[i + GKDI_AHEAD < u->kept ? i + GKDI_AHEAD : i]];
@@ -3780,8 +3913,10 @@ static void gkdi_take_samples(const gkdi_update *u, const gkdi_outcome *o, gkdi_
             continue;
         if (s->radiance > 0) {
             gkdi_item *item = &batch->items[items++];
-            memcpy(item->position, position, sizeof position);
-            memcpy(item->direction, direction, sizeof direction);
+            for (k = 0; k < 3; ++k) { /* memcpy of a pair waits until both were stored */
+                item->position[k] = position[k];
+                item->direction[k] = direction[k];
+            }
             item->nearness = s->nearness;
             item->weight = s->radiance / s->pdf_mix;
             item->weight = item->weight < 1e30f ? item->weight : 1e30f;
@@ -3958,10 +4093,57 @@ static bool gkdi_sample_valid(const gkd_training_sample *s)
            s->pdf_guide < INFINITY && s->nearness >= 0 && s->nearness < INFINITY;
 }
 
+#if GKDI_X86
+/* gkdi_find_cells of 16 positions; lanes are positions. */
+GKDI_EXACT static void gkdi_find_cells_avx2(const gkd_node *nodes, const float (*positions)[16], uint32_t *cells)
+{
+    const int *words = (const int *)(const void *)nodes;
+    __m256i at[2], link[2], leaves;
+    int g;
+    at[0] = at[1] = _mm256_setzero_si256();
+    do {
+        leaves = _mm256_set1_epi32(-1);
+        for (g = 0; g < 2; ++g) {
+            __m256 split = _mm256_castsi256_ps(_mm256_i32gather_epi32(words, at[g], 8)), place, next;
+            link[g] = _mm256_i32gather_epi32(words + 1, at[g], 8);
+            place = _mm256_blendv_ps(_mm256_loadu_ps(positions[0] + 8 * g), _mm256_loadu_ps(positions[1] + 8 * g),
+                                     _mm256_castsi256_ps(_mm256_slli_epi32(link[g], 2)));
+            place = _mm256_blendv_ps(place, _mm256_loadu_ps(positions[2] + 8 * g),
+                                     _mm256_castsi256_ps(_mm256_slli_epi32(link[g], 1)));
+            place = _mm256_cmp_ps(place, split, _CMP_NLT_UQ); /* -1: the upper child */
+            next = _mm256_castsi256_ps(
+                _mm256_sub_epi32(_mm256_and_si256(link[g], _mm256_set1_epi32(0x1fffffff)), _mm256_castps_si256(place)));
+            at[g] =
+                _mm256_castps_si256(_mm256_blendv_ps(next, _mm256_castsi256_ps(at[g]), _mm256_castsi256_ps(link[g])));
+            leaves = _mm256_and_si256(leaves, link[g]);
+        }
+    } while (_mm256_movemask_ps(_mm256_castsi256_ps(leaves)) != 0xff);
+    for (g = 0; g < 2; ++g)
+        _mm256_storeu_si256((__m256i *)(void *)(cells + 8 * g),
+                            _mm256_andnot_si256(_mm256_set1_epi32((int)GKD_LEAF), link[g]));
+}
+#endif
+
 /* gkd_find_cell of up to GKDI_GROUP positions, level by level: how deep a leaf lies cannot be predicted. */
-static void gkdi_find_cells(const gkd_node *nodes, uint32_t count, const float *const *positions, uint32_t *cells)
+static void gkdi_find_cells(uint32_t simd, const gkd_node *nodes, uint32_t count, const float *const *positions,
+                            uint32_t *cells)
 {
     uint32_t at[GKDI_GROUP], k, more = 1;
+#if GKDI_X86
+    if (simd > GKD_SIMD_SCALAR && count > 4) {
+        float columns[3][GKDI_GROUP];
+        for (k = 0; k < GKDI_GROUP; ++k) {
+            const float *p = positions[k < count ? k : count - 1];
+            columns[0][k] = p[0];
+            columns[1][k] = p[1];
+            columns[2][k] = p[2];
+        }
+        gkdi_find_cells_avx2(nodes, (const float(*)[GKDI_GROUP])columns, at);
+        memcpy(cells, at, count * sizeof *cells);
+        return;
+    }
+#endif
+    (void)simd;
     memset(at, 0, sizeof at);
     while (more) {
         more = 0;
@@ -3991,7 +4173,7 @@ static void gkdi_locate(void *context, uint32_t begin, uint32_t end)
             gkdi_place(&u->field->desc, &u->samples[i + k], place[k]);
             valid[k] = gkdi_sample_valid(&u->samples[i + k]);
         }
-        gkdi_find_cells(u->field->nodes, n, places, u->cell_of + i);
+        gkdi_find_cells((uint32_t)u->field->desc.simd, u->field->nodes, n, places, u->cell_of + i);
         for (k = 0; k < n; ++k)
             if (!valid[k])
                 u->cell_of[i + k] = GKDI_NONE;
@@ -5683,7 +5865,7 @@ GKD_API void gkd_find_batch(const gkd_view *view, uint32_t count, const uint32_t
             }
         }
         if (n > 1)
-            gkdi_find_cells(view->nodes, n, at, cells);
+            gkdi_find_cells(view->simd, view->nodes, n, at, cells);
         else
             cells[0] = gkd_find_cell(view, at[0]); /* shorter: nothing to overlap */
         for (k = 0; k < n; ++k) {

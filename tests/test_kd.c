@@ -787,6 +787,47 @@ static void test_results_do_not_depend_on_threads_or_cuts(void **state)
     free(s);
 }
 
+/* A lopsided tree, positions on its planes, far outside, or no numbers: groups of any size find the cells that single
+   queries find. */
+static void test_cells_are_found_alike_at_every_level(void **state)
+{
+    (void)state;
+    enum { LEVELS = 40, GROUP = 16 };
+    static gkd_node nodes[2 * LEVELS + 1];
+    float p[GROUP][3];
+    const float *positions[GROUP];
+    gkd_simd levels[5];
+    uint32_t n = levels_here(levels), cells[GROUP];
+    gkd_view v;
+    memset(&v, 0, sizeof v);
+    v.nodes = nodes;
+    seed(50);
+    for (uint32_t i = 0, at = 0; i < LEVELS; ++i) { /* one child is a leaf, the other goes on */
+        uint32_t pair = 2 * i + 1, side = (uint32_t)(rndf() * 2);
+        nodes[at].link = (uint32_t)(rndf() * 3) << 29 | pair;
+        nodes[at].split = rndf();
+        nodes[pair].link = GKD_LEAF | (2 * i);
+        nodes[pair + 1].link = GKD_LEAF | (2 * i + 1);
+        at = pair + side;
+    }
+    for (int round = 0; round < 2000; ++round) {
+        uint32_t count = 1 + (uint32_t)(rndf() * GROUP);
+        for (uint32_t i = 0; i < count; ++i) {
+            static const float odd[3] = {NAN, INFINITY, -1e30f};
+            for (int k = 0; k < 3; ++k)
+                p[i][k] = rndf() < 0.1f   ? odd[(int)(rndf() * 3)]
+                          : rndf() < 0.5f ? rndf()
+                                          : nodes[(int)(rndf() * 2 * LEVELS)].split;
+            positions[i] = p[i];
+        }
+        for (uint32_t l = 0; l < n; ++l) {
+            gkdi_find_cells((uint32_t)levels[l], nodes, count, positions, cells);
+            for (uint32_t i = 0; i < count; ++i)
+                assert_int_equal(cells[i], gkd_find_cell(&v, p[i]));
+        }
+    }
+}
+
 static void test_training_is_the_same_at_every_level(void **state)
 {
     (void)state;
@@ -1664,6 +1705,7 @@ int main(void)
         cmocka_unit_test(test_positions_outside_are_clamped_and_counted),
         cmocka_unit_test(test_degenerate_input_stays_finite),
         cmocka_unit_test(test_results_do_not_depend_on_threads_or_cuts),
+        cmocka_unit_test(test_cells_are_found_alike_at_every_level),
         cmocka_unit_test(test_training_is_the_same_at_every_level),
         cmocka_unit_test(test_count_rule_splits_at_the_documented_number),
         cmocka_unit_test(test_signature_rule_splits_at_an_edge_of_light_only),

@@ -22,10 +22,9 @@ static void add_sample(gkd_signature *s, const float p[3], const float d[3], flo
     memcpy(item.position, p, sizeof item.position);
     memcpy(item.direction, d, sizeof item.direction);
     item.weight = v;
-    if (v > 0) {
-        gkdi_sum_light(&sum, &shape, &item, list, 1);
-        gkdi_sum_places(&sum, from, &item, list, 1);
-    } else
+    if (v > 0)
+        gkdi_sum_items(GKD_SIMD_SCALAR, &sum, &shape, from, &item, list, 1);
+    else
         sum.samples = 1;
     gkdi_signature_add(s, &sum, from);
 }
@@ -281,10 +280,21 @@ static void test_sums(void)
     }
 }
 
+/* Defaults, with the best level of this machine. */
+static gkd_desc best_level(void)
+{
+    gkd_desc d;
+    memset(&d, 0, sizeof d);
+    d.bounds_max[0] = d.bounds_max[1] = d.bounds_max[2] = 1;
+    CHECK(gkd_resolve(&d, &d) == GKD_OK, "defaults");
+    return d;
+}
+
 /* A pool of samples over and over, in batches of different length: 1e7 of them, with GUIDE_TEST_LONG set 1e9. Truth is
    the pool's sums in extended precision, times how often it came. */
 static void test_drift(void)
 {
+    gkd_desc best = best_level();
     enum { N = 1 << 14 };
     static gkdi_item items[N];
     static uint32_t list[N];
@@ -319,8 +329,7 @@ static void test_drift(void)
             k = 1 + draw() % 4096;
             k = k < N - i ? k : N - i;
             memset(&part, 0, sizeof part);
-            gkdi_sum_light(&part, &shape, items, list + i, k);
-            gkdi_sum_places(&part, from, items, list + i, k);
+            gkdi_sum_items((uint32_t)best.simd, &part, &shape, from, items, list + i, k);
             gkdi_signature_add(&s, &part, from);
         }
     worst = fmax(fabs((double)(s.sum / (sum * turns) - 1)), fabs((double)(s.squares / (squares * turns) - 1)));
@@ -333,6 +342,55 @@ static void test_drift(void)
     CHECK(fabs((double)(s.mean[0] - mean)) < 1e-4, "mean %g off", (double)(s.mean[0] - mean));
     CHECK(fabs((double)((long double)s.variance[0] / spread - 1)) < 1e-3, "variance %g", (double)s.variance[0]);
     CHECK(gkdi_signature_valid(&s), "valid");
+}
+
+/* Sums and cuts of lists have the same bits at the best level of this machine as at the scalar one. */
+static void test_levels(void)
+{
+    enum { N = 4099 };
+    static gkdi_item items[N];
+    static uint32_t list[2][N], other[2][N + 8];
+    const double from[3] = {0.25, 1e4, -3};
+    gkd_desc best = best_level();
+    int round;
+    uint32_t i, k;
+    for (i = 0; i < N; ++i) {
+        double d[3];
+        draw_vmf(3, d);
+        for (k = 0; k < 3; ++k) {
+            items[i].direction[k] = (float)d[k];
+            items[i].position[k] = (float)(from[k] + normal());
+        }
+        items[i].weight = (float)exp(10 * normal());
+        items[i].nearness = INFINITY; /* beside what is read */
+    }
+    for (round = 0; round < 200; ++round) {
+        gkdi_sum sum[2];
+        gkdi_shape shape[2];
+        uint32_t axis = draw() % 3, n = round < 40 ? (uint32_t)round : draw() % N, low[2], above = 0;
+        float split = items[draw() % N].position[axis];
+        split = round % 10 == 9 ? (float)NAN : split;
+        memset(sum, 0, sizeof sum);
+        memset(shape, 0, sizeof shape);
+        for (k = 0; k < 2; ++k) {
+            uint32_t simd = k ? (uint32_t)best.simd : (uint32_t)GKD_SIMD_SCALAR;
+            for (i = 0; i < n; ++i)
+                list[k][i] = (i * 1571u + (uint32_t)round) % N;
+            gkdi_sum_items(simd, &sum[k], &shape[k], from, items, list[k], n);
+            low[k] = gkdi_list_cut(simd, items[0].position + axis, split, list[k], n, other[k]);
+        }
+        CHECK(!memcmp(&sum[0], &sum[1], sizeof sum[0]) && !memcmp(&shape[0], &shape[1], sizeof shape[0]),
+              "sums of %u differ", n);
+        CHECK(low[0] == low[1], "%u and %u of %u below", low[0], low[1], n);
+        for (i = k = 0; i < n; ++i) { /* in the order that they had */
+            uint32_t at = (i * 1571u + (uint32_t)round) % N;
+            bool is_above = !(items[at].position[axis] < split);
+            CHECK(at == (is_above ? other[0][above] : list[0][k]) && at == (is_above ? other[1][above] : list[1][k]),
+                  "%u: item %u is not in its place", n, at);
+            above += is_above;
+            k += !is_above;
+        }
+    }
 }
 
 static void test_split_axis(void)
@@ -1363,6 +1421,15 @@ static void published_formulas_are_word_for_word(void **state)
     assert_int_equal(failures, 0);
 }
 
+static void sums_and_cuts_are_the_same_at_every_level(void **state)
+{
+    (void)state;
+    failures = 0;
+    rng = 15;
+    test_levels();
+    assert_int_equal(failures, 0);
+}
+
 static void batches_are_their_samples(void **state)
 {
     (void)state;
@@ -1420,6 +1487,7 @@ int main(void)
         cmocka_unit_test(direction_test_errs_as_often_as_it_says),
         cmocka_unit_test(tests_hold_for_difficult_light),
         cmocka_unit_test(published_formulas_are_word_for_word),
+        cmocka_unit_test(sums_and_cuts_are_the_same_at_every_level),
         cmocka_unit_test(batches_are_their_samples),
         cmocka_unit_test(uniform_cells_do_not_split),
         cmocka_unit_test(known_steps_split_at_the_predicted_number),
