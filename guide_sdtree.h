@@ -81,7 +81,8 @@
      from the same samples than few long ones [unlike Mueller 2017, who clears the sums and doubles]. Recommended: a
      pass of a quarter of all samples before it.
      Smoothing: what few samples say is uncertain. The shares of a node's children in the sampling tree are
-     (n share + K / 4) / (n + K), n = the node's non-zero samples (mass share times the cell's), K = desc.smoothing.
+     (n share + K / 4) / (n + K), n = the node's non-zero samples (mass share times the cell's), K = desc.smoothing, in
+     trees blurred by t (see below) (1 - t) of it.
 
      Denoising: before it rebuilds a tree, refine moves the leaves' masses by a share t towards the mean of the eight
      squares of their size around them (phi wraps, poles are crossed), a blur whose width follows the tree. t comes from
@@ -4529,7 +4530,7 @@ static void gsdi_write_trees(void *context, uint32_t begin, uint32_t end)
         uint32_t t = gsdi_cells(old)[c].tree;
         if (job->rebuild)
             gsdi_tree_write(r->block, &r->trees[job->tree], job->child, job->mass, s->lit / job->limit_mass,
-                            0.25 * (double)r->desc->smoothing);
+                            0.25 * (1 - job->blur) * (double)r->desc->smoothing);
         else if (job->copy)
             gsdi_tree_copy(r->block, &r->trees[job->tree], old, &gsdi_trees(old)[t]);
     }

@@ -5,7 +5,7 @@
 # samples and of image tiles ("typical": single bright samples do not decide it), and the step's share of the
 # training's CPU seconds.
 #   RENDER=build/render SCENES="ajar torus" TRAIN="8 32" SEEDS="1 2 3" SPP=8 SIZE=160x90 JOBS=2 bench/denoise.sh
-# Names are those of examples/scenes; or files.
+# Names are those of examples/scenes, of folders in $GUIDE_SCENES (kitchen living-room veach-ajar veach-bidir), or files.
 export LC_ALL=C
 cd "$(dirname "$0")/.." || exit 1
 : "${RENDER:=build/render}" "${SCENES:=ajar cornell egg gloss hall hole lamps maze pool spot torus}" "${TRAIN:=8 32}"
@@ -15,25 +15,35 @@ trap 'rm -rf "$tmp"' EXIT
 
 number() { sed -n "s/.*\"$2\": \[*\([-0-9.e+]*\).*/\1/p" "$1"; }
 
-# compare SCENE TRAIN SEED: a line "train scene", then the ratios by the samples of either field, of all samples and typical,
-# and the CPU seconds of the step and of the training.
+# The file of a scene; nothing, and a message, where there is none.
+scene_file() {
+    local file
+    for file in "$1" "examples/scenes/$1.xml" "${GUIDE_SCENES:-/nowhere}/$1/scene.xml" "${GUIDE_SCENES:-/nowhere}/$1/$1.xml"; do
+        [ -f "$file" ] && echo "$file" && return
+    done
+    echo "denoise.sh: skipping $1: not in examples/scenes, and no folder of that name in GUIDE_SCENES" >&2
+    return 1
+}
+
+# compare FILE SCENE TRAIN SEED: a line "train scene", then the ratios by the samples of either field, of all samples and
+# typical, and the CPU seconds of the step and of the training.
 compare() {
-    local file=$1 at=$tmp/$2-$3-$(basename "$1")
-    [ -e "$file" ] || file=examples/scenes/$1.xml
-    local common=("$file" --method sdtree --size "$SIZE" --train "$2" --seed "$3" --threads 1 --quiet -o "$at.exr")
+    local at=$tmp/$3-$4-$2
+    local common=("$1" --method sdtree --size "$SIZE" --train "$3" --seed "$4" --threads 1 --quiet -o "$at.exr")
     "$RENDER" "${common[@]}" --spp 1 --set denoise_when=last --set save="$at.on" --json "$at.json" &&
         "$RENDER" "${common[@]}" --spp "$SPP" --set denoise=off --set save="$at.off" --set compare="$at.on" --json "$at.1" &&
         "$RENDER" "${common[@]}" --spp "$SPP" --set denoise_when=last --set compare="$at.off" --json "$at.2" || return
-    echo "$2 $1 $(number "$at.1" compared) $(number "$at.2" compared) $(number "$at.1" compared_typical)" \
+    echo "$3 $2 $(number "$at.1" compared) $(number "$at.2" compared) $(number "$at.1" compared_typical)" \
         "$(number "$at.2" compared_typical) $(number "$at.json" denoise_seconds) $(number "$at.json" train_seconds)"
     rm -f "$at".*
 }
 
 export RENDER SPP SIZE tmp
 export -f compare number
-for train in $TRAIN; do
-    for scene in $SCENES; do
-        for seed in $SEEDS; do printf '%s %s %s\n' "$scene" "$train" "$seed"; done
+for scene in $SCENES; do
+    file=$(scene_file "$scene") || continue
+    for train in $TRAIN; do
+        for seed in $SEEDS; do printf '"%s" %s %s %s\n' "$file" "$(basename "$scene" .xml)" "$train" "$seed"; done
     done
 done | xargs -P "$JOBS" -L 1 bash -c 'compare "$@" 2>>"$tmp/errors"' compare >"$tmp/rows"
 [ -s "$tmp/rows" ] || { cat "$tmp/errors" >&2; exit 1; }

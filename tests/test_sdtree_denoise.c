@@ -774,6 +774,40 @@ static void plant(gsd_field *f, uint32_t cell, const tree *t, double samples)
     gsdi_field_changed(f);
 }
 
+/* A tree blurred by t is smoothed with (1 - t) K, one that is not with K. */
+static void test_blur_takes_over_from_smoothing(void **state)
+{
+    (void)state;
+    int moved = 0, still = 0;
+    for (uint64_t seed = 1; seed <= 12; ++seed) {
+        gsd_desc d = {.forest_cells = 1, .target = GSD_TARGET_RADIANCE, .smoothing = 5};
+        const double samples = 40;
+        gsd_field *f;
+        tree *t = make_tree(seed, 5, 0.7);
+        for (uint32_t i = 0; i < t->count && seed % 3 == 0; ++i) /* halves that agree */
+            t->sum[i].half[1] = t->sum[i].half[0];
+        OK(gsd_create(&d, &f));
+        plant(f, 0, t, samples);
+        OK(gsd_refine(f, NULL, NULL, NULL));
+        OK(gsd_validate(f));
+        measure(t, false);
+        double blur = gsdi_blur_tree(t->child, t->sum, t->depth, t->count, false, &t->blur), K = 5 * (1 - blur);
+        const gsd_node *root = &gsdi_nodes(f->block)[gsdi_trees(f->block)[gsdi_cells(f->block)[0].tree].root];
+        const double *m = t->mass + t->child[0];
+        double left = samples * (m[0] + m[2]) / t->mass[0] + K / 2;
+        assert_true(fabs((double)root->inner.split[0] - left / (samples + K)) < 1e-6);
+        for (int k = 0; k < 2; ++k) {
+            double low = samples * m[k] / t->mass[0] + K / 4, high = samples * m[k + 2] / t->mass[0] + K / 4;
+            assert_true(fabs((double)root->inner.split[1 + k] - low / (low + high)) < 1e-6);
+        }
+        moved += blur > 0.1;
+        still += blur == 0;
+        gsd_destroy(f);
+        free(t);
+    }
+    assert_true(moved > 3 && still > 2);
+}
+
 static gsd_field *gaussian_forest(gsd_desc d, uint32_t cells)
 {
     gsd_field *f;
@@ -1147,6 +1181,7 @@ int main(void)
         cmocka_unit_test(test_denoising_pays),
         cmocka_unit_test(test_blur_adds_leaves),
         cmocka_unit_test(test_budget_is_kept),
+        cmocka_unit_test(test_blur_takes_over_from_smoothing),
         cmocka_unit_test(test_steps_are_told),
         cmocka_unit_test(test_pass_says_otherwise),
         cmocka_unit_test(test_any_threads_give_the_same_field),
