@@ -327,7 +327,7 @@ bench-error: deps
 run-bench-error: $(B)/render $(B)/bench_error
 	@$(B)/bench_error $(PRESET_$(PRESET)) --out out/bench-error-$(PRESET) $(ARGS)
 
-# Second moments with and without denoising: some 5 minutes on two cores; see bench/denoise.sh.
+# Second moments with and without denoising: some 6 minutes on two cores; see bench/denoise.sh.
 bench-denoise: deps
 	$(SUB) run-bench-denoise
 

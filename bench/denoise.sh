@@ -4,11 +4,11 @@
 # same samples, once by those that each of them drew; the table has the geometric mean of both and over seeds, of all
 # samples and of image tiles ("typical": single bright samples do not decide it), and the step's share of the
 # training's CPU seconds.
-#   RENDER=build/render SCENES="ajar torus" TRAIN="8 32" SEEDS="1 2 3" SPP=8 SIZE=160x90 JOBS=2 bench/denoise.sh
+#   RENDER=build/render SCENES="ajar torus" TRAIN="4 8 32" SEEDS="1 2 3" SPP=8 SIZE=160x90 JOBS=2 bench/denoise.sh
 # Names are those of examples/scenes, of folders in $GUIDE_SCENES (kitchen living-room veach-ajar veach-bidir), or files.
 export LC_ALL=C
 cd "$(dirname "$0")/.." || exit 1
-: "${RENDER:=build/render}" "${SCENES:=ajar cornell egg gloss hall hole lamps maze pool spot torus}" "${TRAIN:=8 32}"
+: "${RENDER:=build/render}" "${SCENES:=ajar cornell egg gloss hall hole lamps maze pool spot torus}" "${TRAIN:=4 8 32}"
 : "${SEEDS:=1 2 3}" "${SPP:=8}" "${SIZE:=160x90}" "${JOBS:=$(nproc 2>/dev/null || echo 2)}"
 tmp=$(mktemp -d) || exit 1
 trap 'rm -rf "$tmp"' EXIT
